@@ -1,0 +1,1 @@
+"""Benchmarks: `python -m benchmarks.run` prints every table of the README."""

@@ -1,0 +1,55 @@
+"""Every solver by its name on the command line: `solve(problem, loss) -> Record`.
+
+Imports happen in the functions, so that each process loads one side's libraries only and memory is each side's own.
+"""
+
+import functools
+import time
+from collections.abc import Callable
+
+from benchmarks.record import Record, Values
+from jaxba.ba import Problem
+from jaxba.geometry import AbstractLoss
+
+Solver = Callable[[Problem, AbstractLoss], Record]
+
+
+def solver(name: str, *, max_nfev: int = 100, scipy_seconds: float = 60.0) -> Solver:
+    """Return `jaxba`, `ceres` or `scipy`, each told to stop after `max_nfev` steps."""
+    if name == "jaxba":
+        return functools.partial(solve_with_jaxba, max_nfev=max_nfev)
+    if name == "ceres":
+        from benchmarks.peers.ceres import solve_with_ceres
+
+        return functools.partial(solve_with_ceres, max_num_iterations=max_nfev)
+    if name == "scipy":
+        from benchmarks.peers.scipy_trf import solve_with_scipy
+
+        return functools.partial(solve_with_scipy, max_nfev=max_nfev, time_limit_s=scipy_seconds)
+    raise ValueError(f"solver {name!r}: choose from jaxba, ceres, scipy.")
+
+
+def solve_with_jaxba(problem: Problem, loss: AbstractLoss, *, max_nfev: int = 100) -> Record:
+    """Solve with jaxba at its defaults.
+
+    All time of the call that is neither compiling nor in its history counts as preprocessing, also what comes after the
+    last step.
+    """
+    import jaxba
+    from jaxba.ba import solve
+
+    start = time.perf_counter()
+    solution = solve(problem, loss=loss, max_nfev=max_nfev)
+    seconds_total = time.perf_counter() - start - solution.seconds_compile
+    return Record(
+        solver=f"jaxba {jaxba.__version__}",
+        initial_cost=solution.history[0]["cost"],
+        final_cost=solution.final_cost,
+        history=solution.history,
+        seconds_preprocess=max(0.0, seconds_total - solution.history[-1]["seconds"]),
+        seconds_compile=solution.seconds_compile,
+        seconds_total=seconds_total,
+        termination=str(solution.result),
+        num_iterations=len(solution.history) - 1,
+        values=Values.of(solution.problem),
+    )

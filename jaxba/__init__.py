@@ -1,0 +1,113 @@
+"""Bundle adjustment, differentiable, on JAX.
+
+`import jaxba` takes milliseconds and loads no jax: a public name loads its module when it is first used (PEP 562).
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+_NAMES = {
+    "jaxba._errors": ("JaxbaError",),
+    "jaxba.ba": (
+        "AttitudePrior",
+        "ControlPointPrior",
+        "Free",
+        "IntrinsicsPrior",
+        "LeverArmPrior",
+        "Observations",
+        "PositionPrior",
+        "Problem",
+    ),
+    "jaxba.geometry": (
+        "BAL",
+        "Arctan",
+        "Barron",
+        "Cauchy",
+        "GemanMcClure",
+        "Huber",
+        "Linear",
+        "OpenCV",
+        "OpenCVFisheye",
+        "Pinhole",
+        "Pose",
+        "Radial",
+        "SimplePinhole",
+        "SimpleRadial",
+        "SoftL1",
+        "Triangulation",
+        "Tukey",
+        "triangulate",
+        "triangulate_two_view",
+    ),
+    "jaxba.io": ("read_bal", "read_tile", "write_bal", "write_tile"),
+}
+"""Public names by the module that defines them. A new one is a word here and one below; a test holds the two equal."""
+
+_MODULES = {
+    "ba": "jaxba.ba",
+    "geometry": "jaxba.geometry",
+    "io": "jaxba.io",
+    "synthetic": "jaxba.scene.synthetic",
+}
+"""Public modules by their public name; `jaxba.geometry` works after `import jaxba` alone."""
+
+if TYPE_CHECKING:
+    from jaxba import ba as ba, geometry as geometry, io as io
+    from jaxba._errors import JaxbaError as JaxbaError
+    from jaxba.ba import (
+        AttitudePrior as AttitudePrior,
+        ControlPointPrior as ControlPointPrior,
+        Free as Free,
+        IntrinsicsPrior as IntrinsicsPrior,
+        LeverArmPrior as LeverArmPrior,
+        Observations as Observations,
+        PositionPrior as PositionPrior,
+        Problem as Problem,
+    )
+    from jaxba.geometry import (
+        BAL as BAL,
+        Arctan as Arctan,
+        Barron as Barron,
+        Cauchy as Cauchy,
+        GemanMcClure as GemanMcClure,
+        Huber as Huber,
+        Linear as Linear,
+        OpenCV as OpenCV,
+        OpenCVFisheye as OpenCVFisheye,
+        Pinhole as Pinhole,
+        Pose as Pose,
+        Radial as Radial,
+        SimplePinhole as SimplePinhole,
+        SimpleRadial as SimpleRadial,
+        SoftL1 as SoftL1,
+        Triangulation as Triangulation,
+        Tukey as Tukey,
+        triangulate as triangulate,
+        triangulate_two_view as triangulate_two_view,
+    )
+    from jaxba.io import (
+        read_bal as read_bal,
+        read_tile as read_tile,
+        write_bal as write_bal,
+        write_tile as write_tile,
+    )
+    from jaxba.scene import synthetic as synthetic
+
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    if name in _MODULE_OF:
+        value = getattr(importlib.import_module(_MODULE_OF[name]), name)
+    elif name in _MODULES:
+        value = importlib.import_module(_MODULES[name])
+    else:
+        raise AttributeError(f"module 'jaxba' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*(name for name in globals() if name.startswith("__")), *_MODULE_OF, *_MODULES})

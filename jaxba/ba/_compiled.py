@@ -1,0 +1,59 @@
+"""Compile a solver's functions for the shapes of a system, once a process.
+
+`jax.jit` keeps what it has compiled, but does not tell a first call's compile time from its running time; here the two are
+apart. jax's persistent cache, where it is switched on, keeps the result across processes.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+from jax import Array
+from jaxtyping import Float
+
+from jaxba.ba._linearise import cost
+from jaxba.ba._rows import Unknowns
+from jaxba.ba._solvers import AbstractSchurSolver, State
+from jaxba.ba._system import System
+
+_KEPT = 32
+
+
+class Compiled(NamedTuple):
+    """Compiled functions: `init(unknowns, system)`, `step(unknowns, state, system)` and `cost(system, unknowns)`."""
+
+    init: jax.stages.Compiled
+    step: jax.stages.Compiled
+    cost: jax.stages.Compiled
+
+
+def compiled(solver: AbstractSchurSolver, unknowns: Unknowns, system: System, plain: System) -> Compiled:
+    """Return the solver's functions, compiled for these arguments' shapes; `plain` is the system without robust losses."""
+    leaves, structure = jax.tree.flatten((unknowns, system, plain))
+    shapes = tuple((leaf.shape, leaf.dtype.name) for leaf in leaves)
+    return _compile(solver, structure, shapes)
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _compile(
+    solver: AbstractSchurSolver, structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[tuple[int, ...], str], ...]
+) -> Compiled:
+    arguments = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
+    unknowns, system, plain = jax.tree.unflatten(structure, arguments)
+
+    def init(unknowns: Unknowns, system: System) -> State:
+        return solver.init(None, unknowns, system, None, None, None, frozenset())
+
+    def step(unknowns: Unknowns, state: State, system: System) -> tuple[Unknowns, State]:
+        return solver.step(None, unknowns, system, None, state, frozenset())[:2]
+
+    def plain_cost(system: System, unknowns: Unknowns) -> Float[Array, ""]:
+        return cost(system, unknowns)
+
+    state = eqx.filter_eval_shape(init, unknowns, system)
+    return Compiled(
+        init=jax.jit(init).lower(unknowns, system).compile(),
+        step=jax.jit(step).lower(unknowns, state, system).compile(),
+        cost=jax.jit(plain_cost).lower(plain, unknowns).compile(),
+    )

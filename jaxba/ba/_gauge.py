@@ -1,0 +1,234 @@
+"""Gauge: which directions of the whole block nothing in a problem fixes.
+
+Images see the same pixels when poses and points move, turn and grow together: seven directions (Triggs et al. 2000,
+section 9). A fixed pose or point, or a prior, holds some of them. With D the 7 tangent directions of the similarity,
+about the block's middle and in units of its size, and J the rows of all priors and of everything fixed,
+
+    free directions = null space of (J D)^T (J D)
+
+A free lever arm adds three columns: in a block without turns it moves as a translation of the block does. Parts of a
+block that share no free pose or point are looked at one by one. Robust losses do not count: they weaken rows, and a row
+that has levelled off at the start values may come back.
+
+Cost: numpy, and the priors' own derivatives in jitted pieces of `_CHUNK` rows, which compile once whatever the problem
+(0.3 s a prior). 2000 images with 500k observations take 0.1 s after that.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+
+from jaxba._errors import JaxbaError
+from jaxba.ba._parts import Parts, hat, mean_by
+from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba._rows import Rows, Unknowns
+from jaxba.geometry import Pose
+
+_CHUNK = 256
+_NULL = 1e-12  # eigenvalue over the largest: a direction held a million times more weakly than another counts as free
+_NEGLIGIBLE = 0.1  # of a direction's largest component: smaller ones are not named
+
+_NAMES = (
+    *(f"translation {a}" for a in "xyz"), *(f"rotation about {a}" for a in "xyz"), "scale",
+    *(f"lever arm {a}" for a in "xyz"),
+)  # fmt: skip
+_TURNING, _MOVING = (3, 4, 5, 6), (0, 1, 2, 7, 8, 9)
+
+
+def free_gauge(problem: Problem) -> tuple[str, ...]:
+    """Return the names of the directions that nothing fixes; empty if the problem is fully determined.
+
+    `translation x`, `rotation about z`, `scale`, ...: one name a free direction, in the world's axes. A rotation about
+    a line that is no axis is named by the axes it is made of, `rotation about x + rotation about y`; the centre of a
+    rotation or of the scaling is not told. `lever arm z` appears where a free lever arm is not determined.
+
+    >>> import jaxba
+    >>> survey = jaxba.synthetic.uav_block(8, gnss_std_m=None)
+    >>> len(jaxba.ba.free_gauge(survey.problem)), jaxba.ba.free_gauge(survey.problem.fix(poses=[0]))
+    (7, ('scale',))
+    """
+    parts = Parts.of(problem)
+    normal, lever_prior = _normal_matrices(problem, parts)
+    columns = 10 if problem.free.lever_arm and not _lever_arm_determined(normal, lever_prior) else 7
+    if columns == 10:
+        normal[:, 7:, 7:] += lever_prior
+    vectors, free = _null(normal[:, :columns, :columns])
+    names = {name for part in np.flatnonzero(free.any(axis=1)) for name in _names(vectors[part][:, free[part]].T)}
+    return tuple(sorted(names, key=lambda name: [_NAMES.index(n) for n in name.split(" + ")]))
+
+
+def require_gauge(problem: Problem, purpose: str) -> None:
+    """Raise `JaxbaError`, with the cure, if `purpose` (e.g. "Covariance") needs a gauge that the problem lacks."""
+    free = free_gauge(problem)
+    if not free:
+        return
+    count = "1 direction is" if len(free) == 1 else f"{len(free)} directions are"
+    cures = ["Add a position prior with finite std_m or three control points, or fix two poses."]
+    if all(name.startswith("rotation") for name in free):
+        cures = ["Positions along one line leave the turn about it: add a control point off it or an attitude prior."]
+    if any("lever arm" in name for name in free):
+        cures = ["Hold the lever arm fixed or add a lever arm prior with finite std_m.", *cures]
+        cures = cures[: 1 if all("lever arm" in name for name in free) else 2]
+    raise JaxbaError(f"{purpose}: problem has no gauge, {count} free ({', '.join(free)}). {' '.join(cures)}")
+
+
+def _normal_matrices(
+    problem: Problem, parts: Parts
+) -> tuple[Float[np.ndarray, "parts 10 10"], Float[np.ndarray, "3 3"]]:
+    """Return (J D)^T (J D) of each part, the lever arm in the last three columns, and the lever arm's own prior.
+
+    Every group of rows is divided by its trace, so that its sigmas' unit does not matter.
+    """
+    normal = np.zeros((len(parts.size), 10, 10))
+    lever_prior = np.zeros((3, 3))
+    normal[:, :7, :7] += _fixed_point_grams(problem, parts)
+    part, index = parts.fixed_poses
+    moved = parts.move_poses(part, _poses(problem, index))
+    moved[:, 3:] /= parts.size[part][:, None, None]
+    normal += _grams(moved, part, len(parts.size))
+    for prior in problem.priors:
+        if not problem.free.lever_arm and not _null(normal[:, :7, :7])[1].any():
+            break  # all is held already: the other priors need not be compiled
+        rows = _derivatives(prior, problem)
+        if rows.pose is None and rows.point is None:
+            if rows.lever_arm is not None:
+                lever = np.asarray(rows.lever_arm).reshape(-1, 3)
+                lever_prior = lever.T @ lever / max(np.sum(lever**2), np.finfo(float).tiny)
+            continue
+        image, point = getattr(prior, "image_index", None), getattr(prior, "point_index", None)
+        part = parts.of_image[np.asarray(image)] if rows.pose is not None else parts.of_point[np.asarray(point)]
+        inside = part >= 0
+        part = part[inside]
+        along = np.zeros((len(part), rows.residual.shape[0], 10))
+        if rows.pose is not None:
+            jacobian = np.moveaxis(np.asarray(rows.pose), 2, 0)[inside]
+            along[:, :, :7] += jacobian @ parts.move_poses(part, _poses(problem, np.asarray(image)[inside]))
+        if rows.point is not None:
+            jacobian = np.moveaxis(np.asarray(rows.point), 2, 0)[inside]
+            along[:, :, :7] += jacobian @ parts.move_points(part, np.asarray(problem.points)[np.asarray(point)[inside]])
+        if rows.lever_arm is not None:
+            along[:, :, 7:] = np.moveaxis(np.asarray(rows.lever_arm), 2, 0)[inside] * parts.size[part][:, None, None]
+        normal += _grams(along, part, len(parts.size))
+    return normal, lever_prior
+
+
+def _fixed_point_grams(problem: Problem, parts: Parts) -> Float[np.ndarray, "parts 7 7"]:
+    """Return the mean of A^T A over the fixed points that each part sees, `A = [I, -hat(x), x]`, from means of x, x x^T.
+
+    Points held fixed may be half a million, where A itself would take a second.
+    """
+    part, index = parts.fixed_points
+    x = (np.asarray(problem.points, float)[index] - parts.center[part]) / parts.size[part][:, None]
+    count = len(parts.size)
+    number = np.bincount(part, minlength=count)
+    mean = mean_by(x, part, count)
+    second = mean_by((x[:, :, None] * x[:, None]).reshape(-1, 9), part, count).reshape(-1, 3, 3)
+    squared, eye = np.trace(second, axis1=1, axis2=2)[:, None, None], np.eye(3)
+    gram = np.zeros((count, 7, 7))
+    gram[:, :3, :3], gram[:, 3:6, 3:6], gram[:, 6:, 6:] = eye, squared * eye - second, squared
+    gram[:, :3, 3:6], gram[:, 3:6, :3] = -hat(mean), hat(mean)
+    gram[:, :3, 6], gram[:, 6, :3] = mean, mean
+    return gram / (3 + 3 * squared) * (number > 0)[:, None, None]
+
+
+def _null(normal: Float[np.ndarray, "parts n n"]) -> tuple[Float[np.ndarray, "parts n n"], Bool[np.ndarray, "parts n"]]:
+    """Return eigenvectors, and which of them are null directions."""
+    values, vectors = np.linalg.eigh(normal)
+    return vectors, values <= _NULL * values[:, -1:]
+
+
+def _lever_arm_determined(normal: Float[np.ndarray, "parts 10 10"], lever_prior: Float[np.ndarray, "3 3"]) -> bool:
+    """Whether the lever arm, which all parts share, is fixed when every part moves freely: its Schur complement."""
+    block, cross, lever = normal[:, :7, :7], normal[:, :7, 7:], normal[:, 7:, 7:]
+    inverse = np.linalg.pinv(block, rcond=_NULL, hermitian=True)
+    schur = lever_prior + np.sum(lever - np.swapaxes(cross, 1, 2) @ inverse @ cross, axis=0)
+    return bool(np.linalg.eigvalsh(schur)[0] > _NULL)
+
+
+def _names(null: Float[np.ndarray, "free columns"]) -> list[str]:
+    """Name a null space: a basis by elimination, rotations and scale first, which hide the translations they bring."""
+    rows, done, names = null.copy(), 0, []
+    for columns in (_TURNING, _MOVING):
+        columns = [c for c in columns if c < rows.shape[1]]
+        pivots = []
+        while done < len(rows):
+            block = np.abs(rows[done:, columns])
+            row, column = np.unravel_index(np.argmax(block), block.shape)
+            if block[row, column] < 1e-5:
+                break
+            rows[[done, done + row]] = rows[[done + row, done]]
+            rows[done] /= rows[done, columns[column]]
+            others = np.arange(len(rows)) != done
+            rows[others] -= rows[others][:, columns[column], None] * rows[done]
+            pivots.append(done)
+            done += 1
+        for pivot in pivots:
+            size = np.abs(rows[pivot, columns])
+            kept = [c for c, s in zip(columns, size, strict=True) if s > _NEGLIGIBLE * size.max()]
+            names.append(" + ".join(_NAMES[c] for c in sorted(kept)))
+    return names
+
+
+def _derivatives(prior: AbstractPrior, problem: Problem) -> Rows:
+    """Return a prior's rows by poses, points and the lever arm, numpy; evaluated on pieces of one size."""
+    fields = {f.name: getattr(prior, f.name) for f in dataclasses.fields(prior)}
+    index_name = next((name for name in fields if name.endswith("_index")), "")
+    if index_name == "camera_index" or (index_name and len(fields[index_name]) == 0):
+        return Rows(residual=np.zeros((0, 0)))  # pyright: ignore[reportArgumentType]
+    with jax.enable_x64(True):
+        if not index_name:
+            rows = _of_geometry(prior, _unknowns(problem, np.zeros(1, int), np.zeros(1, int)))
+            return jax.tree.map(np.asarray, rows)
+        index = np.asarray(fields[index_name])
+        pieces = []
+        for start in range(0, max(len(index), 1), _CHUNK):
+            # the piece's own unknowns, numbered 0, 1, ...; the last row fills it up
+            of_piece = np.minimum(np.arange(start, start + _CHUNK), max(len(index) - 1, 0))
+            local = {n: np.asarray(v, float)[of_piece] for n, v in fields.items() if n not in ("loss", index_name)}
+            piece = dataclasses.replace(prior, **local, **{index_name: np.arange(_CHUNK, dtype=np.int32)})
+            use = {"image_index": np.zeros(1, int), "point_index": np.zeros(1, int), index_name: index[of_piece]}
+            rows = _of_geometry(piece, _unknowns(problem, use["image_index"], use["point_index"]))
+            pieces.append(rows)
+        return jax.tree.map(lambda *a: np.concatenate(a, axis=-1)[..., : len(index)], *pieces)
+
+
+@eqx.filter_jit
+def _of_geometry(prior: AbstractPrior, unknowns: Unknowns) -> Rows:
+    rows = prior.rows(unknowns)
+    return Rows(residual=rows.residual, pose=rows.pose, lever_arm=rows.lever_arm, point=rows.point)
+
+
+def _unknowns(problem: Problem, images: Int[np.ndarray, " n"], points: Int[np.ndarray, " m"]) -> Unknowns:
+    def array(values: Array | np.ndarray) -> Array:
+        return jax.numpy.asarray(np.asarray(values, float))
+
+    return Unknowns(
+        poses=jax.tree.map(array, _poses(problem, images)),
+        intrinsics=jax.numpy.zeros((1, len(type(problem.cameras).parameter_names()))),
+        lever_arm=array(problem.lever_arm),
+        points=array(np.asarray(problem.points)[points]),
+    )
+
+
+def _poses(problem: Problem, images: Int[np.ndarray, " n"]) -> Pose:
+    poses = problem.poses
+    return Pose(np.asarray(poses.quaternion, float)[images], np.asarray(poses.translation, float)[images])
+
+
+def _grams(
+    along: Float[np.ndarray, "n rows columns"], part: Int[np.ndarray, " n"], count: int
+) -> Float[np.ndarray, "parts 10 10"]:
+    """Return the sum of `A^T A` over each part's entries, with a trace of one (or zero)."""
+    columns = along.shape[2]
+    products = (np.swapaxes(along, 1, 2) @ along).reshape(len(part), columns**2)
+    adder = sparse.csr_array((np.ones(len(part)), (part, np.arange(len(part)))), shape=(count, len(part)))
+    summed = (adder @ products).reshape(count, columns, columns)
+    trace = np.trace(summed, axis1=1, axis2=2)
+    out = np.zeros((count, 10, 10))
+    out[:, :columns, :columns] = summed / np.where(trace > 0, trace, 1.0)[:, None, None]
+    return out

@@ -1,0 +1,335 @@
+"""Linearise: the normal equations J^T J and J^T r at some unknowns, robust losses and fixed unknowns taken care of.
+
+They are kept in the blocks that bundle adjustment has, none of which depends on the damping of a step:
+
+- for each image, the products of its rows' columns [pose | refined intrinsics | residual] among themselves;
+- for each observation, W: its point's columns times its image's block (3 x block);
+- for each point, its columns times [refined intrinsics | residual | point].
+
+The derivatives themselves are never stored: they are computed a few thousand rows at a time, in the cache. For 147k rows
+they would take 42 MB, and to touch that much fresh memory costs more time than the derivatives.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.ba._plan import ROW_RUN
+from jaxba.ba._robust import reweighting
+from jaxba.ba._rows import Rows, Step, Unknowns, rows_of
+from jaxba.ba._system import System
+from jaxba.ba.groups import Reprojection
+from jaxba.geometry import AbstractLoss
+
+
+class Linearisation(eqx.Module):
+    """The normal equations, over the columns named above, and the priors' rows.
+
+    - `image_products`: of the columns pose (6), refined intrinsics (k), residual (1).
+    - `w`: W of each row.
+    - `point_products`: the points' 3x3 blocks.
+    - `point_shared`: each point's block with the shared intrinsics, all cameras side by side; none if they are own ones.
+    - `gradient`, `diagonal`: J^T r and the diagonal of J^T J, of all groups.
+    """
+
+    image_products: Float[Array, "images columns columns"]
+    w: Float[Array, "rows 3 block"]
+    point_products: Float[Array, "points 3 3"]
+    point_shared: Float[Array, "points 3 shared"]
+    prior_rows: tuple[Rows, ...]
+    gradient: Step
+    diagonal: Step
+
+
+def cost(system: System, unknowns: Unknowns) -> Float[Array, ""]:
+    """Return half the sum of losses; infinite where a point is not in front of a camera or anything is not finite."""
+    residual, depth = system.reprojection.residual(unknowns)
+    total = jnp.sum(system.loss(residual[0] ** 2 + residual[1] ** 2))
+    for prior in system.priors:
+        total += jnp.sum(prior.loss(sum_components(prior.residual(unknowns) ** 2)))
+    valid = jnp.isfinite(total)
+    if not system.reprojection.model.sees_behind:
+        valid &= jnp.all(depth > 0)
+    return jnp.where(valid, total / 2, jnp.inf)
+
+
+def point_costs(system: System, unknowns: Unknowns) -> Float[Array, " points"]:
+    """Return twice the cost that each point takes part in: its observations and, for control points, its coordinates."""
+    residual, depth = system.reprojection.residual(unknowns)
+    of_rows = system.loss(residual[0] ** 2 + residual[1] ** 2)
+    valid = jnp.isfinite(of_rows)
+    if not system.reprojection.model.sees_behind:
+        valid &= depth > 0
+    of_rows = jnp.where(valid, of_rows, jnp.inf).reshape(-1)
+    total = segments(of_rows, system.reprojection.point_index, system.shape.num_points)
+    for prior in system.priors:
+        rows = prior.rows(unknowns)
+        if rows.point_index is not None:
+            of_prior = prior.loss(sum_components(rows.residual**2))
+            total += segments(of_prior, rows.point_index, system.shape.num_points)
+    return total
+
+
+def point_equations(
+    system: System, unknowns: Unknowns, bend: Float[Array, ""]
+) -> tuple[Float[Array, "points 3"], Float[Array, "points 3 3"]]:
+    """Return the gradient and the block of J^T J of every point, poses and cameras held."""
+
+    def body(of_points: tuple[Array], part: Reprojection) -> tuple[tuple[Array], tuple[()]]:
+        rows = part.rows(unknowns, lambda residual: reweighting(residual, system.loss, bend))
+        columns = rows[:, :, -4:]
+        by_pixel = jnp.moveaxis(columns, 2, 3).swapaxes(1, 2).reshape(-1, 2, 4)
+        products = by_pixel[:, 0, 1:, None] * by_pixel[:, 0, None] + by_pixel[:, 1, 1:, None] * by_pixel[:, 1, None]
+        index = part.point_index.reshape(-1)
+        return (of_points[0].at[index].add(products, mode="promise_in_bounds"),), ()
+
+    start = (jnp.zeros((system.shape.num_points, 3, 4), unknowns.points.dtype),)
+    (of_points,), _ = _scan_chunks(system, body, start)
+    gradient, hessian = of_points[:, :, 0], of_points[:, :, 1:]
+    for prior in system.priors:
+        rows = _robust(prior.rows(unknowns), prior.loss, bend)
+        if rows.point is not None:
+            gradient += segments(_dot(rows.point, rows.residual).T, rows.point_index, system.shape.num_points)
+            products = jnp.einsum("cin,cjn->nij", rows.point, rows.point)
+            hessian += segments(products, rows.point_index, system.shape.num_points)
+    return gradient, hessian
+
+
+def linearise(system: System, unknowns: Unknowns, bend: Float[Array, ""] | float = 0.0) -> Linearisation:
+    """Return the normal equations at `unknowns`.
+
+    - `bend`: how much of a robust loss's curvature is used, 0 to 1; see `_robust.py`.
+    """
+    shape = system.shape
+    dtype = unknowns.points.dtype
+    bend = jnp.asarray(bend, dtype)
+    k, cameras = shape.num_refined, shape.num_shared_cameras
+    first_point = 6 + k + 1
+
+    def body(carry: tuple[Array, Array], part: Reprojection) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        of_points, of_shared = carry
+        rows = part.rows(unknowns, lambda residual: reweighting(residual, system.loss, bend))
+        rows = _masked_columns(rows, part, system)
+        by_lane = jnp.swapaxes(rows, 2, 3)
+        flat = by_lane.reshape(by_lane.shape[0], 2 * ROW_RUN, -1)[:, :, :first_point]
+        image_products = jnp.einsum("rka,rkb->rab", flat, flat)
+
+        pixel = jnp.moveaxis(by_lane, 1, 2).reshape(-1, 2, by_lane.shape[-1])
+        of_point = pixel[:, 0, first_point:, None] * pixel[:, 0, None] + pixel[:, 1, first_point:, None] * pixel[:, 1, None]
+        index = part.point_index.reshape(-1)
+        of_points = of_points.at[index].add(of_point[:, :, 6 + k :], mode="promise_in_bounds")
+        if cameras:
+            camera = rows_of(part.camera_index, part.run_image)[:, None] if cameras > 1 else 0
+            place = (part.point_index * cameras + camera).reshape(-1)
+            of_shared = of_shared.at[place].add(of_point[:, :, 6 : 6 + k], mode="promise_in_bounds")
+        return (of_points, of_shared), (image_products, of_point[:, :, : shape.block])
+
+    start = (
+        jnp.zeros((shape.num_points, 3, 4), dtype),
+        jnp.zeros((shape.num_points * cameras, 3, k), dtype),
+    )
+    (of_points, of_shared), (run_products, w) = _scan_chunks(system, body, start)
+    image_products = sum_runs(system, run_products)
+    of_shared = jnp.swapaxes(of_shared.reshape(shape.num_points, cameras, 3, k), 1, 2)
+    point_shared = of_shared.reshape(shape.num_points, 3, cameras * k)
+
+    zero = jax.tree.map(jnp.zeros_like, system.free)
+    refined = zero.intrinsics.at[:, refined_columns(system)]
+    squares = jnp.diagonal(image_products, axis1=1, axis2=2)
+    to_cameras = functools.partial(sum_cameras, system)
+    gradient = Step(
+        poses=image_products[:, :6, 6 + k],
+        intrinsics=refined.set(to_cameras(image_products[:, 6 : 6 + k, 6 + k])),
+        lever_arm=zero.lever_arm,
+        points=of_points[:, :, 0],
+    )
+    diagonal = Step(
+        poses=squares[:, :6],
+        intrinsics=refined.set(to_cameras(squares[:, 6 : 6 + k])),
+        lever_arm=zero.lever_arm,
+        points=jnp.diagonal(of_points[:, :, 1:], axis1=1, axis2=2),
+    )
+    point_products = of_points[:, :, 1:]
+    prior_rows = tuple(_robust(_masked(p.rows(unknowns), system), p.loss, bend) for p in system.priors)
+    for extra in prior_rows:
+        gradient = _add(gradient, transpose_product(extra, extra.residual, zero))
+        squared = jax.tree.map(lambda a: a**2 if jnp.issubdtype(a.dtype, jnp.floating) else a, extra)
+        diagonal = _add(diagonal, transpose_product(squared, jnp.ones_like(extra.residual), zero))
+        if extra.point is not None:
+            products = jnp.einsum("cin,cjn->nij", extra.point, extra.point)
+            point_products += segments(products, extra.point_index, shape.num_points)
+    return Linearisation(image_products, w, point_products, point_shared, prior_rows, gradient, diagonal)
+
+
+def curvature(system: System, model: Linearisation, step: Step) -> Float[Array, ""]:
+    """Return `d^T J^T J d` along a step, from the blocks."""
+    refined = step.intrinsics[:, refined_columns(system)]
+    of_images = jnp.concatenate([step.poses, rows_of(refined, system.reprojection.camera_index)], axis=1)
+    columns = of_images.shape[1]
+    total = jnp.einsum("ma,mab,mb->", of_images, model.image_products[:, :columns, :columns], of_images)
+    total += jnp.einsum("pi,pij,pj->", step.points, model.point_products, step.points)
+    of_points = segments(w_product(system, model.w, of_images), system.reprojection.point_index, step.points.shape[0])
+    if model.point_shared.shape[-1]:
+        of_points += model.point_shared @ refined.reshape(-1)
+    total += 2 * jnp.vdot(step.points, of_points)
+    # the points' blocks hold the priors on points already
+    for rows in model.prior_rows:
+        alone = Rows(rows.residual, rows.pose_index, rows.pose, rows.camera_index, rows.intrinsics, rows.lever_arm)
+        total += jnp.sum(product(alone, step) ** 2)
+    return total
+
+
+def w_product(
+    system: System, w: Float[Array, "rows 3 block"], images: Float[Array, "images columns"]
+) -> Float[Array, "rows 3"]:
+    """Return W d of each row for a step of the images' blocks."""
+    of_runs = rows_of(images[:, : w.shape[-1]], system.reprojection.run_image)
+    return jnp.einsum("rka,ra->rk", w.reshape(-1, 3 * ROW_RUN, w.shape[-1]), of_runs).reshape(-1, 3)
+
+
+def sum_runs(system: System, runs: Float[Array, "runs *rest"]) -> Float[Array, "images *rest"]:
+    """Sum runs of rows by image."""
+    return jax.ops.segment_sum(
+        runs,
+        system.reprojection.run_image,
+        num_segments=system.shape.num_images,
+        indices_are_sorted=True,
+        mode="promise_in_bounds",
+    )
+
+
+def sum_cameras(system: System, images: Float[Array, "images *rest"]) -> Float[Array, "cameras *rest"]:
+    """Sum images by camera."""
+    return segments(images, system.reprojection.camera_index, system.shape.num_cameras)
+
+
+def segments(values: Float[Array, "n *rest"], index: Int[Array, "..."], count: int) -> Float[Array, "m *rest"]:
+    """Sum values by index."""
+    return jax.ops.segment_sum(values, index.reshape(-1), num_segments=count, mode="promise_in_bounds")
+
+
+def refined_columns(system: System) -> Int[Array, " refined"]:
+    """Columns of the intrinsics that are free in any camera."""
+    return jnp.array([i for i, refined in enumerate(system.shape.refined) if refined], jnp.int32)
+
+
+def product(rows: Rows, step: Step) -> Float[Array, "components rows"]:
+    """Return `J d` of a prior's rows."""
+    total = jnp.zeros_like(rows.residual)
+    if rows.pose is not None:
+        total += _along(rows.pose, step.poses, rows.pose_index)
+    if rows.intrinsics is not None:
+        total += _along(rows.intrinsics, step.intrinsics, rows.camera_index)
+    if rows.lever_arm is not None:
+        total += jnp.einsum("ckn,k->cn", rows.lever_arm, step.lever_arm)
+    if rows.point is not None:
+        total += _along(rows.point, step.points, rows.point_index)
+    return total
+
+
+def transpose_product(rows: Rows, values: Float[Array, "components rows"], zero: Step) -> Step:
+    """Return `J^T v` of a prior's rows; `zero` gives the shapes."""
+    poses, intrinsics, lever_arm, points = zero.poses, zero.intrinsics, zero.lever_arm, zero.points
+    if rows.pose is not None:
+        poses = segments(_dot(rows.pose, values).T, rows.pose_index, poses.shape[0])
+    if rows.intrinsics is not None:
+        intrinsics = segments(_dot(rows.intrinsics, values).T, rows.camera_index, intrinsics.shape[0])
+    if rows.lever_arm is not None:
+        lever_arm = jnp.sum(_dot(rows.lever_arm, values), axis=-1)
+    if rows.point is not None:
+        points = segments(_dot(rows.point, values).T, rows.point_index, points.shape[0])
+    return Step(poses, intrinsics, lever_arm, points)
+
+
+def sum_components(values: Float[Array, "components *rest"]) -> Float[Array, "*rest"]:
+    """Sum over a short leading axis, term by term: XLA's own reduction over such an axis is ten times slower."""
+    return functools.reduce(jnp.add, [values[i] for i in range(values.shape[0])])
+
+
+def _scan_chunks(
+    system: System,
+    body: Callable[[Any, Reprojection], tuple[Any, Any]],
+    carry: Any,
+) -> tuple[Any, Any]:
+    """Fold `body` over chunks of runs; its outputs come back joined along their first axis."""
+    group, runs = system.reprojection, system.shape.chunk_runs
+
+    def split(a: Array) -> Array:
+        return jnp.asarray(a).reshape(-1, runs, *a.shape[1:])
+
+    xy_px = jnp.swapaxes(jnp.asarray(group.xy_px).reshape(2, -1, runs, ROW_RUN), 0, 1)
+    fields = (xy_px, split(group.weight), split(group.point_index), split(group.run_image))
+
+    def step(carry: Any, fields: tuple[Array, ...]) -> tuple[Any, Any]:
+        return body(carry, Reprojection(*fields, group.camera_index, group.model, group.refined))
+
+    carry, out = jax.lax.scan(step, carry, fields)
+    return carry, jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
+
+
+def _add(a: Step, b: Step) -> Step:
+    return jax.tree.map(jnp.add, a, b)
+
+
+def _dot(jacobian: Float[Array, "c k n"], values: Float[Array, "c n"]) -> Float[Array, "k n"]:
+    return sum_components(jacobian * values[:, None])
+
+
+def _along(jacobian: Float[Array, "c k n"], step: Float[Array, "m k"], index: Int[Array, " n"]) -> Float[Array, "c n"]:
+    return sum_components(jnp.swapaxes(jacobian, 0, 1) * rows_of(step, index).T[:, None])
+
+
+def _masked_columns(
+    rows: Float[Array, "runs 2 columns lanes"], group: Reprojection, system: System
+) -> Float[Array, "runs 2 columns lanes"]:
+    """Zero the columns of what is fixed."""
+    shape, free = system.shape, system.free
+    k = shape.num_refined
+    if shape.any_fixed_pose:
+        rows = rows.at[:, :, :6].multiply(rows_of(free.poses, group.run_image)[:, None, :, None])
+    if shape.num_cameras > 1 and k:
+        mask = rows_of(free.intrinsics[:, refined_columns(system)], rows_of(group.camera_index, group.run_image))
+        rows = rows.at[:, :, 6 : 6 + k].multiply(mask[:, None, :, None])
+    if shape.any_fixed_point:
+        rows = rows.at[:, :, 7 + k :].multiply(rows_of(free.points[:, 0], group.point_index)[:, None, None])
+    return rows
+
+
+def _masked(rows: Rows, system: System) -> Rows:
+    free = system.free
+    pose, intrinsics, lever_arm, point = rows.pose, rows.intrinsics, rows.lever_arm, rows.point
+    if pose is not None:
+        pose = pose * rows_of(free.poses, rows.pose_index).T[None]
+    if intrinsics is not None:
+        intrinsics = intrinsics * rows_of(free.intrinsics, rows.camera_index).T[None]
+    if lever_arm is not None:
+        lever_arm = lever_arm * free.lever_arm[:, None]
+    if point is not None:
+        point = point * rows_of(free.points, rows.point_index).T[None]
+    return Rows(
+        rows.residual, rows.pose_index, pose, rows.camera_index, intrinsics, lever_arm, rows.point_index, point
+    )
+
+
+def _robust(rows: Rows, loss: AbstractLoss, bend: Array) -> Rows:
+    residual, reweighted = reweighting(list(rows.residual), loss, bend)
+
+    def optional(jacobian: Array | None) -> Array | None:
+        return None if jacobian is None else jnp.stack(reweighted(list(jacobian)))
+
+    return Rows(
+        jnp.stack(residual),
+        rows.pose_index,
+        optional(rows.pose),
+        rows.camera_index,
+        optional(rows.intrinsics),
+        optional(rows.lever_arm),
+        rows.point_index,
+        optional(rows.point),
+    )

@@ -1,0 +1,214 @@
+"""The adjustment problem: unknowns, observations, priors, what is free and within which bounds.
+
+Host data: arrays may be numpy (the usual case, float64 kept whatever jax is set to) or jax arrays and tracers, when a
+problem is built inside `jit` or differentiated. Units and frames: metres in the world (a local frame, origin near the
+block), pixels in the images with the first pixel's centre at (0.5, 0.5), radians.
+"""
+
+import abc
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxba._errors import JaxbaError
+from jaxba.ba._rows import Rows, Unknowns
+from jaxba.geometry import AbstractCamera, AbstractLoss, Pose
+
+
+class Observations(eqx.Module):
+    """Image measurements of points.
+
+    - `xy_px`: pixels.
+    - `std_px`: standard deviation of each coordinate, pixels.
+    - `image_index`, `point_index`: what is seen where.
+    """
+
+    xy_px: Float[Array | np.ndarray, "observations 2"]
+    std_px: Float[Array | np.ndarray, " observations"]
+    image_index: Int[Array | np.ndarray, " observations"]
+    point_index: Int[Array | np.ndarray, " observations"]
+
+
+class AbstractPrior(eqx.Module):
+    """A residual group beside the reprojections: one file in `ba/groups`, one line in its table.
+
+    `name` is the group's name in files, tables and messages. `loss` is applied to the squared norm of each row's
+    residual, which is already divided by its sigmas.
+    """
+
+    name: ClassVar[str]
+    loss: eqx.AbstractVar[AbstractLoss]
+
+    @abc.abstractmethod
+    def residual(self, unknowns: Unknowns) -> Float[Array, "components rows"]:
+        """Return the residuals over their sigmas, one column a row of the group."""
+
+    @abc.abstractmethod
+    def rows(self, unknowns: Unknowns) -> Rows:
+        """Return residuals and exact derivatives; equal to `jax.jacfwd` of `residual` (a test holds every group to it)."""
+
+
+class Free(eqx.Module):
+    """What the adjustment may change: True is free.
+
+    `intrinsics` has a column for each of the camera model's parameters, in the model's order.
+    """
+
+    poses: Bool[Array | np.ndarray, " images"]
+    points: Bool[Array | np.ndarray, " points"]
+    intrinsics: Bool[Array | np.ndarray, "cameras parameters"]
+    lever_arm: Bool[Array | np.ndarray, ""]
+
+
+class Problem(eqx.Module):
+    """A bundle adjustment problem, with start values for all unknowns.
+
+    - `poses`: `cam_from_world` of each image.
+    - `cameras`: one camera model, its fields with one entry a camera.
+    - `camera_index`: the camera of each image; a survey flown with one camera has zeros.
+    - `points`: metres, world.
+    - `observations`: pixels.
+    - `priors`: position, attitude, intrinsics priors and control points, each at most once.
+    - `lever_arm`: from the camera's centre to the GNSS antenna, metres, camera frame; shared by all images.
+    - `free`: what may change.
+    - `lower`, `upper`: bounds on the intrinsics, infinite where there is none.
+    - `image_names`: used in messages; empty, or one an image.
+
+    `Problem.build` fills in the defaults; `fix` and `bound` return changed copies.
+    """
+
+    poses: Pose
+    cameras: AbstractCamera
+    camera_index: Int[Array | np.ndarray, " images"]
+    points: Float[Array | np.ndarray, "points 3"]
+    observations: Observations
+    priors: tuple[AbstractPrior, ...]
+    lever_arm: Float[Array | np.ndarray, "3"]
+    free: Free
+    lower: Float[Array | np.ndarray, "cameras parameters"]
+    upper: Float[Array | np.ndarray, "cameras parameters"]
+    image_names: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def num_images(self) -> int:
+        return self.poses.translation.shape[0]
+
+    @property
+    def num_points(self) -> int:
+        return self.points.shape[0]
+
+    @property
+    def num_observations(self) -> int:
+        return self.observations.xy_px.shape[0]
+
+    @property
+    def num_cameras(self) -> int:
+        return self.lower.shape[0]
+
+    @staticmethod
+    def build(
+        poses: Pose,
+        cameras: AbstractCamera,
+        points: Float[Array | np.ndarray, "points 3"],
+        observations: Observations,
+        *,
+        camera_index: Int[Array | np.ndarray, " images"] | None = None,
+        priors: Sequence[AbstractPrior] = (),
+        lever_arm: Float[Array | np.ndarray, "3"] | None = None,
+        free: Free | None = None,
+        image_names: Sequence[str] = (),
+    ) -> "Problem":
+        """Return a problem with everything free, no bounds, a zero lever arm held fixed, and one camera for all images.
+
+        A camera without a batch axis becomes a batch of one. Several cameras need `camera_index`.
+        """
+        num_images = poses.translation.shape[0]
+        names = type(cameras).parameter_names()
+        columns = np.broadcast_arrays(*(np.atleast_1d(np.asarray(getattr(cameras, n), float)) for n in names))
+        cameras = type(cameras)(*(np.array(column) for column in columns))
+        num_cameras = columns[0].shape[0]
+        if camera_index is None:
+            if num_cameras > 1:
+                raise JaxbaError(f"{num_cameras} cameras but no camera_index; give the camera of each image.")
+            camera_index = np.zeros(num_images, np.int32)
+        if free is None:
+            free = Free(
+                poses=np.ones(num_images, bool),
+                points=np.ones(points.shape[0], bool),
+                intrinsics=np.ones((num_cameras, len(names)), bool),
+                lever_arm=np.array(False),
+            )
+        return Problem(
+            poses=poses,
+            cameras=cameras,
+            camera_index=camera_index,
+            points=points,
+            observations=observations,
+            priors=tuple(priors),
+            lever_arm=np.zeros(3) if lever_arm is None else lever_arm,
+            free=free,
+            lower=np.full((num_cameras, len(names)), -np.inf),
+            upper=np.full((num_cameras, len(names)), np.inf),
+            image_names=tuple(image_names),
+        )
+
+    def fix(
+        self,
+        *,
+        poses: Sequence[int] | bool = False,
+        points: Sequence[int] | bool = False,
+        intrinsics: Sequence[str] | bool = False,
+    ) -> "Problem":
+        """Return the problem with more blocks held fixed.
+
+        Each argument is True for all of its kind, or the indices (of intrinsics: the parameters' names) to fix.
+        """
+        free_poses, free_points = np.array(self.free.poses), np.array(self.free.points)
+        free_intrinsics = np.array(self.free.intrinsics)
+        free_poses[slice(None) if poses is True else list(poses or ())] = False
+        free_points[slice(None) if points is True else list(points or ())] = False
+        names = type(self.cameras).parameter_names()
+        fixed_names = names if intrinsics is True else tuple(intrinsics or ())
+        for name in fixed_names:
+            if name not in names:
+                raise JaxbaError(f"intrinsic {name!r}: a {type(self.cameras).__name__} camera has {', '.join(names)}.")
+            free_intrinsics[:, names.index(name)] = False
+        free = Free(free_poses, free_points, free_intrinsics, self.free.lever_arm)
+        return eqx.tree_at(lambda p: p.free, self, free)
+
+    def bound(self, **bounds: tuple[float, float]) -> "Problem":
+        """Return the problem with box bounds on intrinsics, e.g. `bound(k1=(-0.1, 0.1))`.
+
+        `focal=(0.9, 1.1)` bounds every focal length relative to its start value; all other names are parameters of the
+        model, with absolute bounds.
+        """
+        names = type(self.cameras).parameter_names()
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        for key, (low, high) in bounds.items():
+            if not low < high:
+                raise JaxbaError(f"bounds {key}={low},{high}: the lower bound must be below the upper one.")
+            if key == "focal":
+                for name in names:
+                    if name in ("f", "fx", "fy"):
+                        start = np.asarray(getattr(self.cameras, name))
+                        lower[:, names.index(name)], upper[:, names.index(name)] = low * start, high * start
+            elif key in names:
+                lower[:, names.index(key)], upper[:, names.index(key)] = low, high
+            else:
+                raise JaxbaError(
+                    f"bounds {key}: a {type(self.cameras).__name__} camera has focal, {', '.join(names)}."
+                )
+        return eqx.tree_at(lambda p: (p.lower, p.upper), self, (lower, upper))
+
+    def prior(self, name: str) -> AbstractPrior | None:
+        """Return the prior of this name, or None."""
+        return next((prior for prior in self.priors if prior.name == name), None)
+
+    def image_label(self, index: int) -> str:
+        """Return `image 14 (DJI_0021.JPG)`, for messages."""
+        name = f" ({self.image_names[index]})" if self.image_names else ""
+        return f"image {index}{name}"

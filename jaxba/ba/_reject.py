@@ -1,0 +1,80 @@
+"""Rounds of solve and reject: observations beyond median + factor x MAD are left out, and the rest is solved again.
+
+The threshold is the one surveyors know from other programs: the median of the reprojection errors in pixels plus `mad_factor`
+times their median absolute deviation, not scaled. Each round judges all observations anew, so one that was left out comes back
+if it fits after all.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool
+
+from jaxba._errors import JaxbaError
+from jaxba.ba._problem import Observations, Problem
+from jaxba.ba._quality import Quality, quality
+from jaxba.ba._solution import Solution
+from jaxba.ba._solve import solve
+
+
+@dataclasses.dataclass(frozen=True)
+class Rejected:
+    """Result of `solve_and_reject`.
+
+    - `solution`: of the last round.
+    - `used`: the observations that the last round used.
+    - `quality`: errors of all observations at the solution, statistics over those used.
+    - `num_rejected`: rejected before each round after the first.
+    """
+
+    solution: Solution
+    used: Bool[np.ndarray, " observations"]
+    quality: Quality
+    num_rejected: tuple[int, ...]
+
+
+def solve_and_reject(problem: Problem, *, rounds: int = 2, mad_factor: float = 2.5, **options: Any) -> Rejected:
+    """Solve, then `rounds` times reject by the MAD rule and solve again from there; `options` are those of `solve`.
+
+    >>> import jaxba
+    >>> survey = jaxba.synthetic.uav_block(8, outlier_fraction=0.05)
+    >>> cleaned = jaxba.solve_and_reject(survey.problem, rounds=2, loss=jaxba.Huber(1.0))
+    >>> bool((cleaned.used & survey.truth.is_outlier).sum() < 0.1 * survey.truth.is_outlier.sum())
+    True
+    """
+    if rounds < 0:
+        raise JaxbaError(f"rounds {rounds}: give 0 or more.")
+    if mad_factor <= 0:
+        raise JaxbaError(f"mad_factor {mad_factor}: give a positive number, such as 2.5.")
+    used = np.ones(problem.num_observations, bool)
+    solution, used = _solve_with(problem, used, options)
+    found = quality(solution.apply(problem), used, mad_factor=mad_factor)
+    num_rejected = []
+    for _ in range(rounds):
+        fits = found.error_px <= found.threshold_px
+        if np.array_equal(fits, used) or solution.result == "interrupted":
+            break
+        num_rejected.append(int(np.count_nonzero(~fits)))
+        solution, used = _solve_with(solution.apply(problem), fits, options)
+        found = quality(solution.apply(problem), used, mad_factor=mad_factor)
+    return Rejected(solution, used, found, tuple(num_rejected))
+
+
+def _solve_with(
+    problem: Problem, used: Bool[np.ndarray, " observations"], options: dict[str, Any]
+) -> tuple[Solution, Bool[np.ndarray, " observations"]]:
+    """Solve with some of the observations; return the solution and which of them the solve itself kept."""
+    seen = problem.observations
+    subset = Observations(
+        np.asarray(seen.xy_px)[used],
+        np.asarray(seen.std_px)[used],
+        np.asarray(seen.image_index)[used],
+        np.asarray(seen.point_index)[used],
+    )
+    solution = solve(eqx.tree_at(lambda p: p.observations, problem, subset), **options)
+    kept = used.copy()
+    if solution.report is not None:
+        kept[used] = ~solution.report.dropped.observations
+    return solution, kept

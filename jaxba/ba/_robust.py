@@ -1,0 +1,44 @@
+"""Robust reweighting of residuals and their derivatives.
+
+With s = |r|^2 of a row and loss rho(s), the row enters the normal equations as in Triggs et al. 2000 (section 4.3), which
+keeps the curvature of rho along r:
+
+    r~ = sqrt(rho') / (1 - alpha) r        J~ = sqrt(rho') (I - alpha r r^T / s) J
+
+with alpha the smaller root of `alpha^2 / 2 - alpha - rho'' s / rho' = 0`. `J~^T r~ = rho' J^T r` is the exact gradient for any
+alpha, so alpha is free to be held below `bend`: 0 is iteratively reweighted least squares, a safe overestimate of the
+curvature far from the optimum, 1 the full curvature, fast near it.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxba.geometry import AbstractLoss, Linear
+
+Components = list[Array]
+"""A row's components, each an array over rows."""
+
+
+def reweighting(
+    residual: Sequence[Array], loss: AbstractLoss, bend: Float[Array, ""]
+) -> tuple[Components, Callable[[Sequence[Array]], Components]]:
+    """Return the robust residual, and the function that makes a column of J one of J~."""
+    if isinstance(loss, Linear):
+        return list(residual), list
+    squared = functools.reduce(jnp.add, [r * r for r in residual])
+    _, slope, curvature = loss.derivatives(squared)
+    slope = jnp.maximum(slope, 1e-12)  # a loss that has levelled off leaves a row without weight, not without a shape
+    root = jnp.sqrt(slope)
+    alpha = jnp.minimum(1 - jnp.sqrt(jnp.maximum(1 + 2 * curvature * squared / slope, 0.0)), bend)
+    length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+    unit = [r / length for r in residual]
+
+    def reweighted(column: Sequence[Array]) -> Components:
+        along = alpha * functools.reduce(jnp.add, [u * c for u, c in zip(unit, column, strict=True)])
+        return [root * (c - u * along) for u, c in zip(unit, column, strict=True)]
+
+    return [root / (1 - alpha) * r for r in residual], reweighted

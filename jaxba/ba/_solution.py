@@ -1,0 +1,128 @@
+"""What `solve` returns: the adjusted unknowns, how the solver got there and what it left out."""
+
+import dataclasses
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.ba._check import Dropped
+from jaxba.ba._problem import Problem
+from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
+from jaxba.geometry import AbstractCamera, Pose
+
+RESULTS = {
+    RUNNING: "max_nfev",
+    FTOL: "ftol",
+    XTOL: "xtol",
+    GTOL: "gtol",
+    STUCK: "stuck",
+    NOT_FINITE: "not_finite",
+}
+"""Names of a solution's status."""
+
+_ADVICE = {
+    "ftol": "Converged: the cost no longer changes (ftol).",
+    "xtol": "Converged: the unknowns no longer change (xtol).",
+    "gtol": "Converged: the gradient is zero (gtol).",
+    "max_nfev": "Not converged after max_nfev steps. Continue from here with more, or, if the cost is still high, look at the "
+    "input: wrong focal length, wrong matches under a loss that is not robust.",
+    "stuck": "Not converged: no step lowers the cost. Look for points at infinity or images with few points; a robust loss, "
+    "priors or fixed intrinsics make such problems better posed.",
+    "not_finite": "Not started: the cost at the start values is not finite. Some point may lie in a camera's own plane.",
+    "interrupted": "Interrupted: these are the values reached so far.",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class HistoryStep:
+    """One step tried: when it ended (seconds, compile time left out), the cost after it, and how the step came about.
+
+    - `change`: by which the cost fell. `gradient`: largest entry of the gradient before the step. `step`: its length.
+    - `trust`: damping (Levenberg-Marquardt) or radius (dogleg) for the next step.
+    """
+
+    step: int
+    seconds: float
+    cost: float
+    accepted: bool
+    change: float = 0.0
+    gradient: float = 0.0
+    step_norm: float = 0.0
+    trust: float = 0.0
+    linear_iterations: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What a solve on the host tells beside its numbers.
+
+    - `history`: the start and every step tried.
+    - `dropped`: what was left out of the problem, with reasons; `dropped.summary()` says it in words.
+    - `free_gauge`: directions that nothing fixes; empty if the problem is fully determined.
+    - `seconds_setup`: checks and structure; `seconds_compile`; `seconds_solve`: the steps.
+    - `linear_solver`: how the reduced system was solved.
+    """
+
+    history: tuple[HistoryStep, ...]
+    dropped: Dropped
+    free_gauge: tuple[str, ...]
+    seconds_setup: float
+    seconds_compile: float
+    seconds_solve: float
+    linear_solver: str
+    interrupted: bool
+
+
+class Solution(eqx.Module):
+    """Adjusted unknowns, in the problem's own order.
+
+    - `initial_cost`, `final_cost`: half the sum of losses over all groups. `plain_cost`: the same without the losses.
+    - `status`: why the solver stopped; `result` names it.
+    - `report`: None for a solve inside `jit`, `vmap` or a derivative.
+    """
+
+    poses: Pose
+    cameras: AbstractCamera
+    points: Float[Array | np.ndarray, "points 3"]
+    lever_arm: Float[Array | np.ndarray, "3"]
+    initial_cost: Float[Array | np.ndarray, ""]
+    final_cost: Float[Array | np.ndarray, ""]
+    plain_cost: Float[Array | np.ndarray, ""]
+    status: Int[Array | np.ndarray, ""]
+    num_steps: Int[Array | np.ndarray, ""]
+    report: Report | None = eqx.field(static=True, default=None)
+
+    @property
+    def result(self) -> str:
+        """One of ftol, xtol, gtol (converged), max_nfev, stuck, not_finite, interrupted."""
+        if self.report is not None and self.report.interrupted:
+            return "interrupted"
+        return RESULTS[int(self.status)]
+
+    @property
+    def converged(self) -> bool:
+        """Whether one of the convergence tests was met."""
+        return self.result in ("ftol", "xtol", "gtol")
+
+    @property
+    def advice(self) -> str:
+        """Why the solver stopped, and what to do."""
+        return _ADVICE[self.result]
+
+    def apply(self, problem: Problem) -> Problem:
+        """Return the problem with the solution's values as start values."""
+
+        def unknowns(p: Problem) -> tuple[object, ...]:
+            return p.poses, p.cameras, p.points, p.lever_arm
+
+        return eqx.tree_at(unknowns, problem, (self.poses, self.cameras, self.points, self.lever_arm))
+
+
+def to_host(tree: eqx.Module) -> eqx.Module:
+    """Return the tree with numpy arrays in place of jax's."""
+    as_numpy: Callable[[object], object] = lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf  # noqa: E731
+    return jax.tree.map(as_numpy, tree)

@@ -1,0 +1,325 @@
+"""`SchurLevenbergMarquardt` and `SchurDogleg`: optimistix least-squares solvers for bundle adjustment.
+
+Both minimise `residuals(unknowns, system)` with a `System` as `args`: they take derivatives block by block from the system
+itself, never a Jacobian of the whole function, so `optimistix.least_squares(residuals, solver, unknowns, args=system)` is how
+they run under `jit`, `vmap` and differentiation. `jaxba.solve` calls the same `init`, `step` and `terminate` one step at a time.
+
+A step is kept when the cost falls by at least `_MIN_RATIO` of what the quadratic model promised. A step that puts a point
+behind a camera or makes anything infinite has infinite cost, so it is refused and the next one is shorter.
+"""
+
+import abc
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax import Array
+from jaxtyping import Bool, Float, Int, PyTree
+
+from jaxba.ba._factor import solve_reduced
+from jaxba.ba._linearise import Linearisation, cost, curvature, linearise
+from jaxba.ba._refine import refine_points
+from jaxba.ba._rows import Step, Unknowns
+from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, reduce_vector, to_reduced
+from jaxba.ba._system import System
+
+_MIN_RATIO = 1e-3
+_BEND, _BEND_BELOW = 0.5, 0.1  # use half a robust loss's curvature once steps change the cost by less than a tenth
+_MIN_DIAGONAL = 1e-12  # of the largest entry of its kind
+_MAX_DAMPING = 1e16
+
+RUNNING, FTOL, XTOL, GTOL, STUCK, NOT_FINITE = range(6)
+"""Values of `State.status`: still going, one of three convergence tests met, no step found, bad start."""
+
+
+class State(eqx.Module):
+    """State of either solver; `trust` is the damping (Levenberg-Marquardt) or the radius (dogleg)."""
+
+    trust: Float[Array, ""]
+    bend: Float[Array, ""]
+    factor: Float[Array, ""]
+    cost: Float[Array, ""]
+    change: Float[Array, ""]
+    gradient_norm: Float[Array, ""]
+    step_norm: Float[Array, ""]
+    linear_iterations: Int[Array, ""]
+    accepted: Bool[Array, ""]
+    status: Int[Array, ""]
+    num_steps: Int[Array, ""]
+
+
+class Proposal(NamedTuple):
+    """A step, and the number of linear iterations it took."""
+
+    step: Step
+    linear_iterations: Int[Array, ""]
+
+
+def residuals(unknowns: Unknowns, system: System) -> tuple[Float[Array, "components rows"], ...]:
+    """Return the robust residuals of every group, whose squares sum to twice the cost: `sqrt(rho(s) / s) r`, `s = |r|^2`."""
+
+    def robust(residual: Array, loss: Callable[[Array], Array]) -> Array:
+        squared = jnp.sum(residual**2, axis=0)
+        positive = squared > 0
+        safe = jnp.where(positive, squared, 1.0)
+        return residual * jnp.where(positive, jnp.sqrt(loss(safe) / safe), 1.0)
+
+    reprojection = robust(system.reprojection.residual(unknowns)[0], system.loss)
+    return (reprojection, *(robust(prior.residual(unknowns), prior.loss) for prior in system.priors))
+
+
+class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, State]):
+    """What both solvers share: linearise, propose, keep or refuse, and when to stop.
+
+    - `rtol`, `atol`: `ftol` and `gtol` in scipy's words; `xtol` is a field of its own.
+    - `initial_trust`: damping or radius to start with.
+    """
+
+    rtol: eqx.AbstractVar[float]
+    atol: eqx.AbstractVar[float]
+    xtol: eqx.AbstractVar[float]
+    norm: eqx.AbstractVar[Callable[[PyTree], Float[Array, ""]]]
+    initial_trust: eqx.AbstractVar[float]
+
+    @abc.abstractmethod
+    def propose(self, system: System, unknowns: Unknowns, model: Linearisation, trust: Float[Array, ""]) -> Proposal:
+        """Return a step from the quadratic model under the present trust."""
+
+    @abc.abstractmethod
+    def adapt(self, state: State, ratio: Float[Array, ""], scaled_norm: Float[Array, ""]) -> tuple[Array, Array]:
+        """Return the next trust and factor, given actual over promised decrease and the length of the step tried."""
+
+    def init(
+        self, fn: Any, y: Unknowns, args: System, options: Any, f_struct: Any, aux_struct: Any, tags: frozenset[object]
+    ) -> State:
+        del fn, options, f_struct, aux_struct, tags
+        start = cost(args, y)
+        zero = jnp.zeros_like(start)
+        return State(
+            trust=zero + self.initial_trust,
+            bend=zero,
+            factor=zero + 2,
+            cost=start,
+            change=zero,
+            gradient_norm=zero + jnp.inf,
+            step_norm=zero + jnp.inf,
+            linear_iterations=jnp.array(0),
+            accepted=jnp.array(True),
+            status=jnp.where(jnp.isfinite(start), RUNNING, NOT_FINITE),
+            num_steps=jnp.array(0),
+        )
+
+    def step(
+        self, fn: Any, y: Unknowns, args: System, options: Any, state: State, tags: frozenset[object]
+    ) -> tuple[Unknowns, State, Any]:
+        del fn, options, tags
+        system = args
+        model = linearise(system, y, state.bend)
+        gradient_norm = _projected_gradient_norm(system, y, model.gradient)
+        step, linear_iterations = self.propose(system, y, model, state.trust)
+        step = _within_bounds(system, y, step)
+        promised = -_slope(model.gradient, step) - curvature(system, model, step) / 2
+        trial = refine_points(system, y.retract(step), y, state.bend > 0)
+        trial_cost = cost(system, trial)
+        finite = jnp.isfinite(promised) & jnp.isfinite(trial_cost)
+        change = jnp.where(finite, state.cost - trial_cost, -jnp.inf)
+        ratio = jnp.where(finite & (promised > 0), change / promised, -1.0)
+        at_optimum = gradient_norm <= self.atol
+        accepted = (ratio > _MIN_RATIO) & ~at_optimum
+        trust, factor = self.adapt(state, ratio, _scaled_norm(step, model.diagonal))
+
+        step_norm, size = _norm(step), _size(y)
+        small = finite & (promised <= self.rtol * state.cost) & (jnp.abs(change) <= self.rtol * state.cost)
+        short = finite & (step_norm <= self.xtol * (self.xtol + size))
+        status = jnp.where(self._exhausted(trust), STUCK, RUNNING)
+        status = jnp.where(short, XTOL, status)
+        status = jnp.where(small, FTOL, status)
+        status = jnp.where(at_optimum, GTOL, status)
+        new = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), trial, y)
+        new_state = State(
+            trust=trust,
+            bend=jnp.where(accepted, jnp.where(change < _BEND_BELOW * state.cost, _BEND, state.bend), 0.0),
+            factor=factor,
+            cost=jnp.where(accepted, trial_cost, state.cost),
+            change=jnp.where(accepted, change, 0.0),
+            gradient_norm=gradient_norm,
+            step_norm=step_norm,
+            linear_iterations=linear_iterations,
+            accepted=accepted,
+            status=status,
+            num_steps=state.num_steps + 1,
+        )
+        return new, new_state, None
+
+    def terminate(
+        self, fn: Any, y: Unknowns, args: System, options: Any, state: State, tags: frozenset[object]
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        del fn, y, args, options, tags
+        failed = (state.status == STUCK) | (state.status == NOT_FINITE)
+        result = optx.RESULTS.where(failed, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
+        return state.status != RUNNING, result
+
+    def postprocess(
+        self,
+        fn: Any,
+        y: Unknowns,
+        aux: Any,
+        args: System,
+        options: Any,
+        state: State,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[Unknowns, Any, dict[str, Any]]:
+        del fn, args, options, tags, result
+        return y, aux, {"cost": state.cost, "status": state.status, "num_steps": state.num_steps}
+
+    @abc.abstractmethod
+    def _exhausted(self, trust: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether trust has shrunk so far that no step can be found."""
+
+
+class SchurLevenbergMarquardt(AbstractSchurSolver):
+    """Levenberg-Marquardt on the Schur complement, damped by `trust * diag(J^T J)` (Marquardt 1963; update as in Ceres)."""
+
+    rtol: float = 1e-8
+    atol: float = 1e-10
+    xtol: float = 1e-8
+    norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
+    initial_trust: float = 1e-4
+
+    def propose(self, system: System, unknowns: Unknowns, model: Linearisation, trust: Float[Array, ""]) -> Proposal:
+        return _damped_step(system, unknowns, model, trust)
+
+    def adapt(self, state: State, ratio: Float[Array, ""], scaled_norm: Float[Array, ""]) -> tuple[Array, Array]:
+        del scaled_norm
+        good = ratio > _MIN_RATIO
+        shrink = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
+        trust = jnp.where(good, state.trust * shrink, state.trust * state.factor)
+        return jnp.maximum(trust, 1e-16), jnp.where(good, 2.0, state.factor * 2)
+
+    def _exhausted(self, trust: Float[Array, ""]) -> Bool[Array, ""]:
+        return trust > _MAX_DAMPING
+
+
+class SchurDogleg(AbstractSchurSolver):
+    """Powell's dogleg: between steepest descent and the Gauss-Newton step, within a radius in units of `sqrt(diag(J^T J))`."""
+
+    rtol: float = 1e-8
+    atol: float = 1e-10
+    xtol: float = 1e-8
+    norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
+    initial_trust: float = 1e4
+
+    def propose(self, system: System, unknowns: Unknowns, model: Linearisation, trust: Float[Array, ""]) -> Proposal:
+        newton, linear_iterations = _damped_step(system, unknowns, model, jnp.asarray(1e-10, trust.dtype))
+        finite = jnp.isfinite(_norm(newton))
+        scale = _scale(model.diagonal)
+        descent = jax.tree.map(lambda g, d, free: -free * g / d, model.gradient, scale, system.free)
+        descent = _within_bounds(system, unknowns, descent)
+        bent = curvature(system, model, descent)
+        length = jnp.where(bent > 0, -_slope(model.gradient, descent) / bent, 1.0)
+        cauchy = jax.tree.map(lambda d: length * d, descent)
+        cauchy_norm = _scaled_norm(cauchy, model.diagonal)
+        cauchy = jax.tree.map(lambda c: c * jnp.minimum(1.0, trust / cauchy_norm), cauchy)
+        newton = jax.tree.map(lambda n, c: jnp.where(finite, n, c), newton, cauchy)
+        # the largest t in [0, 1] with |cauchy + t (newton - cauchy)| <= radius
+        leg = jax.tree.map(jnp.subtract, newton, cauchy)
+
+        def inner(a: Step, b: Step) -> Float[Array, ""]:
+            return _total(jax.tree.map(lambda x, y, d: jnp.sum(x * y * d), a, b, scale))
+
+        a, b, c = inner(leg, leg), inner(cauchy, leg), inner(cauchy, cauchy) - trust**2
+        root = jnp.sqrt(jnp.maximum(b**2 - a * c, 0.0))
+        t = jnp.where(a > 0, -jnp.minimum(c, 0.0) / jnp.maximum(b + root, jnp.finfo(a.dtype).tiny), 1.0)
+        t = jnp.clip(t, 0.0, 1.0)
+        return Proposal(jax.tree.map(lambda c, d: c + t * d, cauchy, leg), linear_iterations)
+
+    def adapt(self, state: State, ratio: Float[Array, ""], scaled_norm: Float[Array, ""]) -> tuple[Array, Array]:
+        good = ratio > _MIN_RATIO
+        grown = jnp.where(ratio > 0.75, jnp.maximum(state.trust, 3 * scaled_norm), state.trust)
+        shrunk = 0.5 * jnp.minimum(state.trust, scaled_norm)
+        return jnp.where(ratio < 0.25, jnp.where(good, 0.5 * state.trust, shrunk), grown), state.factor
+
+    def _exhausted(self, trust: Float[Array, ""]) -> Bool[Array, ""]:
+        return trust < 1 / _MAX_DAMPING
+
+
+def _damped_step(system: System, unknowns: Unknowns, model: Linearisation, damping: Float[Array, ""]) -> Proposal:
+    """Return the minimiser of the quadratic model plus `damping * d^T diag(J^T J) d / 2`, the border within its bounds."""
+    scaled = jax.tree.map(lambda d: damping * d, _scale(model.diagonal))
+    reduced = eliminate_points(system, model, scaled)
+    rhs = jax.tree.map(lambda g: -g, model.gradient)
+    lower, upper = _step_bounds(system, unknowns)
+    solved = solve_reduced(system, reduced, reduce_vector(system, reduced, rhs), lower, upper)
+    return Proposal(back_substitute(system, reduced, rhs, solved.vector), solved.iterations)
+
+
+def _step_bounds(system: System, unknowns: Unknowns) -> tuple[Array | None, Array | None]:
+    """Bounds of the border's step; None where nothing is bounded."""
+    if not system.shape.any_bound:
+        return None, None
+    infinite = jnp.full(3, jnp.inf, unknowns.points.dtype)
+
+    def border(bound: Array, lever_arm: Array) -> Array:
+        like = Step(
+            jnp.zeros((system.shape.num_images, 6), bound.dtype), bound - unknowns.intrinsics, lever_arm, unknowns.points
+        )
+        vector: ReducedVector = to_reduced(system, like)
+        return vector.border
+
+    return border(system.lower, -infinite), border(system.upper, infinite)
+
+
+def _within_bounds(system: System, unknowns: Unknowns, step: Step) -> Step:
+    if not system.shape.any_bound:
+        return step
+    moved = jnp.clip(unknowns.intrinsics + step.intrinsics, system.lower, system.upper)
+    intrinsics = jnp.where(system.free.intrinsics > 0, moved - unknowns.intrinsics, 0.0)
+    return eqx.tree_at(lambda s: s.intrinsics, step, intrinsics)
+
+
+def _projected_gradient_norm(system: System, unknowns: Unknowns, gradient: Step) -> Float[Array, ""]:
+    """Largest entry of the gradient, without what presses an intrinsic against its bound."""
+    intrinsics = gradient.intrinsics
+    if system.shape.any_bound:
+        at_lower, at_upper = unknowns.intrinsics <= system.lower, unknowns.intrinsics >= system.upper
+        intrinsics = jnp.where((at_lower & (intrinsics > 0)) | (at_upper & (intrinsics < 0)), 0.0, intrinsics)
+    projected = eqx.tree_at(lambda g: g.intrinsics, gradient, intrinsics)
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0.0) for leaf in jax.tree.leaves(projected)]))
+
+
+def _total(tree: PyTree) -> Float[Array, ""]:
+    """Sum scalars."""
+    return functools.reduce(jnp.add, jax.tree.leaves(tree))
+
+
+def _scale(diagonal: Step) -> Step:
+    """The diagonal of J^T J, kept away from zero relative to its kind."""
+
+    def scale(d: Array) -> Array:
+        largest = jnp.max(d, initial=0.0)
+        return jnp.maximum(d, jnp.where(largest > 0, _MIN_DIAGONAL * largest, 1.0))
+
+    return jax.tree.map(scale, diagonal)
+
+
+def _slope(gradient: Step, step: Step) -> Float[Array, ""]:
+    return _total(jax.tree.map(jnp.vdot, gradient, step))
+
+
+def _norm(step: Step) -> Float[Array, ""]:
+    return jnp.sqrt(_total(jax.tree.map(lambda s: jnp.sum(s**2), step)))
+
+
+def _scaled_norm(step: Step, diagonal: Step) -> Float[Array, ""]:
+    scale = _scale(diagonal)
+    return jnp.sqrt(_total(jax.tree.map(lambda s, d: jnp.sum(s**2 * d), step, scale)))
+
+
+def _size(unknowns: Unknowns) -> Float[Array, ""]:
+    values = (unknowns.poses.translation, unknowns.intrinsics, unknowns.lever_arm, unknowns.points)
+    return jnp.sqrt(_total([jnp.sum(v**2) for v in values]))

@@ -1,0 +1,192 @@
+"""System: a problem in the solver's own order and padded shapes, the one argument of every compiled function.
+
+`make_system` moves values from the problem into the layout of its plan; `initial_unknowns` and `restore` move unknowns in and
+out. On the host this is numpy, so nothing compiles for a shape that is not a bucket's; with tracers it is jax.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import Tracer
+from jaxtyping import Float, Int
+
+from jaxba.ba._plan import ROW_RUN, Plan, Shape, bucket
+from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba._rows import Step, Unknowns
+from jaxba.ba.groups import Reprojection
+from jaxba.geometry import AbstractLoss, Pose
+
+
+class System(eqx.Module):
+    """A bundle adjustment problem ready to be solved.
+
+    - `free`: 1 where an unknown may change, 0 where it is fixed or padding.
+    - `lower`, `upper`: bounds on the intrinsics.
+    - `pair_*`, `block_*`: see `Plan`.
+    """
+
+    reprojection: Reprojection
+    loss: AbstractLoss
+    priors: tuple[AbstractPrior, ...]
+    free: Step
+    lower: Float[Array | np.ndarray, "cameras parameters"]
+    upper: Float[Array | np.ndarray, "cameras parameters"]
+    pair_first: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
+    pair_second: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
+    pair_block: Int[Array | np.ndarray, " pair_runs"]
+    block_row: Int[Array | np.ndarray, " blocks"]
+    block_column: Int[Array | np.ndarray, " blocks"]
+    shape: Shape = eqx.field(static=True)
+
+
+def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = np.float64) -> System:
+    """Return the system of a problem under a plan made from the same indices."""
+    xp = _namespace((problem, loss))
+    shape, observations = plan.shape, problem.observations
+    seen = plan.row_observation >= 0
+    source = np.where(seen, plan.row_observation, 0)
+    weight = xp.where(seen, 1 / xp.asarray(observations.std_px, dtype)[source], 0.0)
+    camera_of_image = _camera_of_image(problem, plan)
+    runs = (-1, ROW_RUN)
+    reprojection = Reprojection(
+        xy_px=xp.asarray(observations.xy_px, dtype)[source].T.reshape(2, *runs),
+        weight=weight.reshape(runs),
+        point_index=plan.row_point.reshape(runs),
+        run_image=plan.row_image[::ROW_RUN],
+        camera_index=camera_of_image,
+        model=type(problem.cameras),
+        refined=shape.refined,
+    )
+    cameras = _cameras_in_order(plan, problem.num_cameras, np.asarray(problem.camera_index))
+    free = Step(
+        poses=_padded(xp, problem.free.poses, plan.image_order, shape.num_images, 0.0, dtype)[:, None]
+        * xp.ones((1, 6), dtype),
+        intrinsics=_padded(xp, problem.free.intrinsics, cameras, shape.num_cameras, 0.0, dtype),
+        lever_arm=xp.asarray(problem.free.lever_arm, dtype) * xp.ones(3, dtype),
+        points=_padded(xp, problem.free.points, plan.point_order, shape.num_points, 0.0, dtype)[:, None]
+        * xp.ones((1, 3), dtype),
+    )
+    return System(
+        reprojection=reprojection,
+        loss=_as_arrays(xp, loss, dtype),
+        priors=tuple(_reordered(xp, prior, problem, plan, cameras, dtype) for prior in problem.priors),
+        free=free,
+        lower=_padded(xp, problem.lower, cameras, shape.num_cameras, -np.inf, dtype),
+        upper=_padded(xp, problem.upper, cameras, shape.num_cameras, np.inf, dtype),
+        pair_first=plan.pair_first,
+        pair_second=plan.pair_second,
+        pair_block=plan.pair_block,
+        block_row=plan.block_row,
+        block_column=plan.block_column,
+        shape=shape,
+    )
+
+
+def initial_unknowns(problem: Problem, plan: Plan, dtype: Any = np.float64) -> Unknowns:
+    """Return the problem's start values in the solver's order."""
+    xp = _namespace(problem)
+    shape = plan.shape
+    quaternion = _padded(xp, problem.poses.quaternion, plan.image_order, shape.num_images, 0.0, dtype)
+    quaternion = xp.concatenate([quaternion[: len(plan.image_order)], _identity(shape.num_images - len(plan.image_order))])
+    names = type(problem.cameras).parameter_names()
+    parameters = xp.stack([xp.asarray(getattr(problem.cameras, name), dtype) for name in names], axis=-1)
+    cameras = _cameras_in_order(plan, problem.num_cameras, np.asarray(problem.camera_index))
+    return Unknowns(
+        poses=Pose(
+            xp.asarray(quaternion, dtype),
+            _padded(xp, problem.poses.translation, plan.image_order, shape.num_images, 0.0, dtype),
+        ),
+        intrinsics=_padded(xp, parameters, cameras, shape.num_cameras, None, dtype),
+        lever_arm=xp.asarray(problem.lever_arm, dtype),
+        points=_padded(xp, problem.points, plan.point_order, shape.num_points, 1.0, dtype),
+    )
+
+
+def restore(unknowns: Unknowns, problem: Problem, plan: Plan) -> Unknowns:
+    """Return the unknowns in the problem's own order, without padding."""
+    xp = _namespace(unknowns)
+    image_rank, point_rank = np.argsort(plan.image_order), np.argsort(plan.point_order)
+    cameras = _cameras_in_order(plan, problem.num_cameras, np.asarray(problem.camera_index))
+    camera_rank = np.argsort(cameras)
+    return Unknowns(
+        poses=Pose(
+            xp.asarray(unknowns.poses.quaternion)[image_rank], xp.asarray(unknowns.poses.translation)[image_rank]
+        ),
+        intrinsics=xp.asarray(unknowns.intrinsics)[camera_rank],
+        lever_arm=xp.asarray(unknowns.lever_arm),
+        points=xp.asarray(unknowns.points)[point_rank],
+    )
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether any leaf is a tracer of jax's."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _namespace(tree: Any) -> Any:
+    """numpy for concrete values, jax.numpy where anything is traced."""
+    return jnp if is_traced(tree) else np
+
+
+def _as_arrays(xp: Any, loss: AbstractLoss, dtype: Any) -> AbstractLoss:
+    """Scales as arrays, so that another scale is not another program to compile."""
+    return jax.tree.map(lambda leaf: xp.asarray(leaf, dtype), loss)
+
+
+def _identity(count: int) -> Float[np.ndarray, "count 4"]:
+    quaternion = np.zeros((count, 4))
+    quaternion[:, 0] = 1
+    return quaternion
+
+
+def _cameras_in_order(plan: Plan, num_cameras: int, camera_index: np.ndarray) -> Int[np.ndarray, " cameras"]:
+    """Original index of each camera in the solver's order: that of the images where each has its own."""
+    return camera_index[plan.image_order] if plan.shape.own_cameras else np.arange(num_cameras)
+
+
+def _camera_of_image(problem: Problem, plan: Plan) -> Int[np.ndarray, " images"]:
+    if plan.shape.own_cameras:
+        return np.arange(plan.shape.num_images, dtype=np.int32)
+    camera = np.zeros(plan.shape.num_images, np.int32)
+    camera[: len(plan.image_order)] = np.asarray(problem.camera_index)[plan.image_order]
+    return camera
+
+
+def _padded(xp: Any, values: Any, order: np.ndarray, count: int, fill: float | None, dtype: Any) -> Any:
+    """Reorder along the first axis and pad to `count`, with a value or with copies of the first entry."""
+    ordered = xp.asarray(values, dtype)[order]
+    missing = count - len(order)
+    tail_shape = (missing, *ordered.shape[1:])
+    tail = xp.broadcast_to(ordered[:1], tail_shape) if fill is None else xp.full(tail_shape, fill, dtype)
+    return xp.concatenate([ordered, tail]) if missing else ordered
+
+
+def _reordered(
+    xp: Any, prior: AbstractPrior, problem: Problem, plan: Plan, cameras: np.ndarray, dtype: Any
+) -> AbstractPrior:
+    """Return a prior with its indices in the solver's order, padded to a bucket with rows of infinite sigma."""
+    ranks = {
+        "image_index": np.argsort(plan.image_order),
+        "point_index": np.argsort(plan.point_order),
+        "camera_index": np.argsort(cameras),
+    }
+    changed: dict[str, Any] = {}
+    for field in dataclasses.fields(prior):
+        value = getattr(prior, field.name)
+        if field.name == "loss":
+            changed["loss"] = _as_arrays(xp, value, dtype)
+            continue
+        if field.name in ranks:
+            value = ranks[field.name][np.asarray(value)].astype(np.int32)
+        else:
+            value = xp.asarray(value, dtype)
+        count = value.shape[0]
+        fill = np.inf if field.name.startswith("std") else None
+        of = np.int32 if field.name in ranks else dtype
+        changed[field.name] = _padded(xp, value, np.arange(count), bucket(count), fill, of)
+    return dataclasses.replace(prior, **changed)

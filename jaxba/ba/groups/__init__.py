@@ -1,0 +1,19 @@
+"""Residual groups: one file each. A new prior is one file and one line in `PRIORS`."""
+
+from jaxba.ba._problem import AbstractPrior
+from jaxba.ba.groups._attitude import AttitudePrior
+from jaxba.ba.groups._control import ControlPointPrior
+from jaxba.ba.groups._intrinsics import IntrinsicsPrior
+from jaxba.ba.groups._lever_arm import LeverArmPrior
+from jaxba.ba.groups._position import PositionPrior
+from jaxba.ba.groups._reprojection import Reprojection
+
+PRIORS: dict[str, type[AbstractPrior]] = {
+    prior.name: prior
+    for prior in (PositionPrior, AttitudePrior, IntrinsicsPrior, ControlPointPrior, LeverArmPrior)
+}
+"""Every prior that a problem can hold, by name; files and messages are driven by this table."""
+
+__all__ = [
+    "PRIORS", "AttitudePrior", "ControlPointPrior", "IntrinsicsPrior", "LeverArmPrior", "PositionPrior", "Reprojection",
+]  # fmt: skip

@@ -1,0 +1,28 @@
+"""Lever arm prior: the measured offset from the camera to the antenna, `r = (l - l0) / sigma`."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxba.ba._problem import AbstractPrior
+from jaxba.ba._rows import Rows, Unknowns
+from jaxba.geometry import AbstractLoss, Linear
+
+
+class LeverArmPrior(AbstractPrior):
+    """Measured lever arm: `xyz` metres in the camera's frame, `std_m` a sigma an axis; one row."""
+
+    name: ClassVar[str] = "lever_arm"
+    xyz: Float[Array | np.ndarray, "1 3"]
+    std_m: Float[Array | np.ndarray, "1 3"]
+    loss: AbstractLoss = Linear()
+
+    def residual(self, unknowns: Unknowns) -> Float[Array, "3 1"]:
+        return ((unknowns.lever_arm[None] - self.xyz) / jnp.asarray(self.std_m)).T
+
+    def rows(self, unknowns: Unknowns) -> Rows:
+        derivative = jnp.eye(3, dtype=unknowns.lever_arm.dtype) / jnp.asarray(self.std_m).T
+        return Rows(residual=self.residual(unknowns), lever_arm=derivative[:, :, None])

@@ -1,0 +1,54 @@
+"""Position priors: GNSS positions of the antenna, with a sigma an axis and a lever arm.
+
+    r = (C + R^T l - g) / sigma,   C = -R^T t
+
+With the step (w, v) on the left of the pose, `dC/dw = 0`, `dC/dv = -R^T`, `d(R^T l)/dw = R^T [l]_x`, `d/dl = R^T`.
+"""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.ba._problem import AbstractPrior
+from jaxba.ba._rows import Rows, Unknowns, rotation_rows, rows_of
+from jaxba.geometry import AbstractLoss, Linear
+
+
+class PositionPrior(AbstractPrior):
+    """Measured antenna positions of some images.
+
+    - `xyz`: metres, world. `std_m`: sigma an axis; infinite where an axis is not measured.
+    - `loss`: robust against single bad fixes, e.g. `Cauchy(3.0)`, in units of sigma.
+    """
+
+    name: ClassVar[str] = "position"
+    image_index: Int[Array | np.ndarray, " rows"]
+    xyz: Float[Array | np.ndarray, "rows 3"]
+    std_m: Float[Array | np.ndarray, "rows 3"]
+    loss: AbstractLoss = Linear()
+
+    def residual(self, unknowns: Unknowns) -> Float[Array, "3 rows"]:
+        rotation = rotation_rows(unknowns.poses.rotation, jnp.asarray(self.image_index))
+        translation = rows_of(unknowns.poses.translation, self.image_index).T
+        antenna = jnp.einsum("jin,jn->in", rotation, unknowns.lever_arm[:, None] - translation)
+        return (antenna - jnp.asarray(self.xyz).T) / jnp.asarray(self.std_m).T
+
+    def rows(self, unknowns: Unknowns) -> Rows:
+        rotation = rotation_rows(unknowns.poses.rotation, jnp.asarray(self.image_index))
+        transposed = jnp.swapaxes(rotation, 0, 1) / jnp.asarray(self.std_m).T[:, None]
+        x, y, z = unknowns.lever_arm
+        # R^T [l]_x, column by column
+        turn = [
+            transposed[:, 1] * z - transposed[:, 2] * y,
+            transposed[:, 2] * x - transposed[:, 0] * z,
+            transposed[:, 0] * y - transposed[:, 1] * x,
+        ]
+        return Rows(
+            residual=self.residual(unknowns),
+            pose_index=jnp.asarray(self.image_index),
+            pose=jnp.concatenate([jnp.stack(turn, axis=1), -transposed], axis=1),
+            lever_arm=transposed,
+        )

@@ -1,0 +1,107 @@
+"""Reprojection: pixel of a point minus its measurement, over the measurement's sigma.
+
+With p = R x + t the point in the camera, A = d pixel / d p (2x3) and the pose's step (w, v) on the left,
+
+    d/dw = -A [p]_x        d/dv = A        d/dx = A R        d/dK = d pixel / d intrinsics
+
+Only A and d/dK come from jax, one forward derivative for each of x, y, z and each refined intrinsic, elementwise; so the
+chain is exact for every camera model.
+
+**Layout.** Observations lie in runs of `ROW_RUN` lanes that share an image. R x + t and A R are batched matrix products, one a
+run: XLA stores the result of a product, where it would compute an elementwise expression anew for each of the twenty
+columns that need it. 147k rows take 6 ms, and 21 ms without the products.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.ba._rows import Unknowns, rows_of
+from jaxba.geometry import AbstractCamera
+
+Components = Sequence[Array]
+Reweighting = Callable[[Components], tuple[Components, Callable[[Components], Components]]]
+"""From the residual's components to the robust ones and the function that makes columns of J robust."""
+
+
+class Reprojection(eqx.Module):
+    """The observations of a problem as a residual group.
+
+    - `weight`: 1/sigma, zero for padding.
+    - `run_image`: the image of each run.
+    - `refined`: which of the model's parameters get derivative columns (static).
+    """
+
+    xy_px: Float[Array, "2 runs lanes"]
+    weight: Float[Array, "runs lanes"]
+    point_index: Int[Array, "runs lanes"]
+    run_image: Int[Array, " runs"]
+    camera_index: Int[Array, " images"]
+    model: type[AbstractCamera] = eqx.field(static=True)
+    refined: tuple[bool, ...] = eqx.field(static=True)
+
+    def residual(self, unknowns: Unknowns) -> tuple[Float[Array, "2 runs lanes"], Float[Array, "runs lanes"]]:
+        """Return the weighted residuals, and the depth z of each point in its camera in metres (1 in padding)."""
+        _, (x, y, z) = self._point_in_cam(unknowns)
+        u, v = self._pixel(x, y, z, *self._intrinsics(unknowns))
+        return jnp.stack(self._weighted((u - self.xy_px[0], v - self.xy_px[1]))), z
+
+    def rows(self, unknowns: Unknowns, reweighting: Reweighting | None = None) -> Float[Array, "runs 2 columns lanes"]:
+        """Return residuals and exact derivatives, both made robust by `reweighting` where it is given.
+
+        Columns: pose (6), refined intrinsics, residual (1), point (3). A robust loss multiplies each row of J from the left,
+        so it is applied to A and d/dK before the chain rule.
+        """
+        rotation, (x, y, z) = self._point_in_cam(unknowns)
+        arguments = (x, y, z, *(jnp.broadcast_to(k, x.shape) for k in self._intrinsics(unknowns)))
+        u, v = self._pixel(*arguments)
+        residual = self._weighted((u - self.xy_px[0], v - self.xy_px[1]))
+        residual, reweighted = (residual, list) if reweighting is None else reweighting(residual)
+
+        def column(index: int) -> Components:
+            def along(value: Array) -> tuple[Array, Array]:
+                return self._pixel(*arguments[:index], value, *arguments[index + 1 :])
+
+            derivative = jax.jvp(along, (arguments[index],), (jnp.ones_like(arguments[index]),))[1]
+            return reweighted(self._weighted(derivative))
+
+        by_xyz = jnp.stack([component for i in range(3) for component in column(i)], axis=1)
+        num_runs, lanes = x.shape
+        by_point = jnp.einsum("rki,rkm->rim", rotation, by_xyz.reshape(num_runs, 3, 2 * lanes))
+        by_point = by_point.reshape(num_runs, 3, 2, lanes)
+        by_intrinsics = [column(3 + i) for i, refined in enumerate(self.refined) if refined]
+        rows = []
+        for c in range(2):
+            a = [by_xyz[:, 2 * i + c] for i in range(3)]
+            turn = [a[2] * y - a[1] * z, a[0] * z - a[2] * x, a[1] * x - a[0] * y]
+            intrinsics = [k[c] for k in by_intrinsics]
+            point = [by_point[:, i, c] for i in range(3)]
+            rows.append(jnp.stack([*turn, *a, *intrinsics, residual[c], *point], axis=1))
+        return jnp.stack(rows, axis=1)
+
+    def _point_in_cam(self, unknowns: Unknowns) -> tuple[Float[Array, "runs 3 3"], tuple[Array, Array, Array]]:
+        pose = jnp.concatenate([unknowns.poses.rotation, unknowns.poses.translation[:, :, None]], axis=-1)
+        pose = rows_of(pose, self.run_image)
+        ones = jnp.ones((unknowns.points.shape[0], 1), unknowns.points.dtype)
+        point = rows_of(jnp.concatenate([unknowns.points, ones], axis=1), self.point_index)
+        x, y, z = jnp.moveaxis(jnp.einsum("rij,rlj->ril", pose, point), 1, 0)
+        return pose[:, :, :3], (x, y, jnp.where(self.weight > 0, z, 1.0))
+
+    def _intrinsics(self, unknowns: Unknowns) -> list[Array]:
+        """Intrinsics of each run's camera, one array a parameter; scalars where all images share one camera."""
+        values = unknowns.intrinsics
+        if values.shape[0] == 1:
+            return [values[0, i] for i in range(values.shape[1])]
+        of_runs = rows_of(values, rows_of(self.camera_index, self.run_image))
+        return [of_runs[:, i, None] for i in range(values.shape[1])]
+
+    def _pixel(self, x: Array, y: Array, z: Array, *parameters: Array) -> tuple[Array, Array]:
+        camera = self.model(**dict(zip(self.model.parameter_names(), parameters, strict=True)))
+        return camera.project_components(x, y, z)
+
+    def _weighted(self, pair: Components) -> Components:
+        return [jnp.where(self.weight > 0, a * self.weight, 0.0) for a in pair]

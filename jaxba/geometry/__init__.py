@@ -1,0 +1,47 @@
+"""Geometry in pure jax: rotations, poses, cameras, robust losses, triangulation."""
+
+from jaxba.geometry._cameras import (
+    BAL,
+    CAMERAS,
+    AbstractCamera,
+    OpenCV,
+    OpenCVFisheye,
+    Pinhole,
+    Radial,
+    SimplePinhole,
+    SimpleRadial,
+)
+from jaxba.geometry._losses import (
+    LOSSES,
+    AbstractLoss,
+    Arctan,
+    Barron,
+    Cauchy,
+    GemanMcClure,
+    Huber,
+    Linear,
+    SoftL1,
+    Tukey,
+)
+from jaxba.geometry._pose import Pose, se3_exp, se3_log
+from jaxba.geometry._rotation import (
+    hat,
+    matrix_from_quaternion,
+    quaternion_conjugate,
+    quaternion_exp,
+    quaternion_from_matrix,
+    quaternion_log,
+    quaternion_multiply,
+    so3_exp,
+    so3_left_jacobian_inverse,
+    so3_log,
+)
+from jaxba.geometry._triangulate import Triangulation, refine_point, triangulate, triangulate_two_view
+
+__all__ = [
+    "BAL", "CAMERAS", "LOSSES", "AbstractCamera", "AbstractLoss", "Arctan", "Barron", "Cauchy", "GemanMcClure", "Huber",
+    "Linear", "OpenCV", "OpenCVFisheye", "Pinhole", "Pose", "Radial", "SimplePinhole", "SimpleRadial", "SoftL1",
+    "Triangulation", "Tukey", "hat", "matrix_from_quaternion", "quaternion_conjugate", "quaternion_exp",
+    "quaternion_from_matrix", "quaternion_log", "quaternion_multiply", "refine_point", "se3_exp", "se3_log", "so3_exp",
+    "so3_left_jacobian_inverse", "so3_log", "triangulate", "triangulate_two_view",
+]  # fmt: skip

@@ -1,0 +1,131 @@
+"""Small bundle adjustment problems of every camera model, with every prior."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxba.ba import (
+    AttitudePrior,
+    ControlPointPrior,
+    IntrinsicsPrior,
+    LeverArmPrior,
+    Observations,
+    PositionPrior,
+    Problem,
+)
+from jaxba.geometry import (
+    BAL,
+    AbstractCamera,
+    AbstractLoss,
+    Linear,
+    OpenCV,
+    OpenCVFisheye,
+    Pinhole,
+    Pose,
+    Radial,
+    SimplePinhole,
+    SimpleRadial,
+)
+
+EVERY_CAMERA = (
+    SimplePinhole(f=800.0, cx=500.0, cy=400.0),
+    Pinhole(fx=800.0, fy=805.0, cx=500.0, cy=400.0),
+    SimpleRadial(f=800.0, cx=500.0, cy=400.0, k1=-0.05),
+    Radial(f=800.0, cx=500.0, cy=400.0, k1=-0.05, k2=0.02),
+    OpenCV(fx=800.0, fy=805.0, cx=500.0, cy=400.0, k1=-0.05, k2=0.02, p1=0.001, p2=-0.002, k3=0.003),
+    OpenCVFisheye(fx=800.0, fy=805.0, cx=500.0, cy=400.0, k1=-0.05, k2=0.02, k3=-0.01, k4=0.002),
+    BAL(f=800.0, k1=-0.05, k2=0.02),
+)
+"""One camera of every model."""
+
+
+def small_problem(
+    camera: AbstractCamera,
+    *,
+    num_images: int = 5,
+    num_points: int = 20,
+    num_cameras: int = 1,
+    seen_by: int = 4,
+    lever_arm: bool = False,
+    num_outliers: int = 0,
+    prior_loss: AbstractLoss | None = None,
+    seed: int = 0,
+) -> Problem:
+    """Return a flight along x, 3 m between images and 10 m above the points, with all five priors.
+
+    Each point lies in the `seen_by` nearest images but for every sixth observation; pixels have 0.5 px of noise and
+    outliers 30 px. The last image has no measured height, the last camera no calibrated last parameter and the last
+    control point no surveyed height. Cameras look down with any heading, tilted by 0.15 rad.
+    """
+    rng = np.random.default_rng(seed)
+    prior_loss = Linear() if prior_loss is None else prior_loss
+    names = camera.parameter_names()
+    along = 3.0 * np.arange(num_images)
+    centers = np.column_stack([along, rng.uniform(-2, 2, num_images), 10 + rng.uniform(-1, 1, num_images)])
+    headings = Rotation.from_rotvec([0, 0, 1] * rng.uniform(-np.pi, np.pi, (num_images, 1)))
+    down = Rotation.from_rotvec([np.pi, 0, 0]) * headings
+    attitudes = Rotation.from_rotvec(0.15 * rng.normal(size=(num_images, 3))) * down
+    points = np.column_stack(
+        [rng.uniform(0, along[-1], num_points), rng.uniform(-4, 4, num_points), rng.uniform(-1.5, 1.5, num_points)]
+    )
+    arm = np.array([0.1, -0.2, 0.3]) * lever_arm
+
+    camera_index = rng.permutation(np.arange(num_images) % num_cameras).astype(np.int32)
+    scale = np.array([1e-3 if n.startswith("f") else 1.0 if n.startswith("c") else 1e-2 for n in names])
+    parameters = np.array([float(getattr(camera, n)) for n in names])
+    scale = np.where([n.startswith("f") for n in names], scale * parameters, scale)
+    true_parameters = parameters + scale * rng.normal(size=(num_cameras, len(names))) * (num_cameras > 1)
+
+    distance = np.abs(points[None, :, 0] - along[:, None])
+    seen = np.argsort(np.argsort(distance, axis=0), axis=0) < seen_by
+    image_index, point_index = (index.astype(np.int32) for index in np.nonzero(seen))
+    kept = rng.permutation(len(image_index)) >= len(image_index) // 6
+    image_index, point_index = image_index[kept], point_index[kept]
+    in_cam = attitudes[image_index].apply(points[point_index] - centers[image_index])
+    of_row = type(camera)(*true_parameters[camera_index[image_index]].T)
+    xy_px = np.asarray(of_row.project(jnp.asarray(in_cam))) + 0.5 * rng.normal(size=(len(image_index), 2))
+    outliers = rng.permutation(len(xy_px))[:num_outliers]
+    xy_px[outliers] += 30 * rng.normal(size=(num_outliers, 2))
+
+    gnss_std_m = np.tile([0.05, 0.04, 0.06], (num_images, 1))
+    antennas = centers + attitudes.inv().apply(arm) + gnss_std_m * rng.normal(size=(num_images, 3))
+    gnss_std_m[-1, 2] = np.inf
+    gimbal = Rotation.from_rotvec(0.02 * rng.normal(size=(num_images, 3))) * attitudes
+    with_attitude = np.arange(0, num_images, 2, dtype=np.int32)
+    calibration_std = np.tile(2 * scale, (num_cameras, 1))
+    calibrated = true_parameters + calibration_std * rng.normal(size=true_parameters.shape)
+    calibration_std[-1, -1] = np.inf
+    control = np.array([num_points - 1, 0, num_points // 2], np.int32)
+    control_std_m = np.tile([0.02, 0.02, 0.03], (3, 1))
+    surveyed = points[control] + control_std_m * rng.normal(size=(3, 3))
+    control_std_m[-1, 2] = np.inf
+    measured_arm = arm + 0.05 * rng.normal(size=3) * lever_arm
+    every_image, every_camera = np.arange(num_images, dtype=np.int32), np.arange(num_cameras, dtype=np.int32)
+    priors = [
+        PositionPrior(every_image[::-1].copy(), antennas[::-1], gnss_std_m[::-1], prior_loss),
+        AttitudePrior(
+            with_attitude,
+            gimbal.as_quat(scalar_first=True)[with_attitude],
+            np.full((len(with_attitude), 3), 0.02),
+            prior_loss,
+        ),
+        IntrinsicsPrior(every_camera, calibrated, calibration_std),
+        ControlPointPrior(control, surveyed, control_std_m, prior_loss),
+    ]
+    if lever_arm:
+        priors.append(LeverArmPrior(measured_arm[None], np.full((1, 3), 0.05)))
+
+    start = Rotation.from_rotvec(0.003 * rng.normal(size=(num_images, 3))) * attitudes
+    start_centers = centers + 0.03 * rng.normal(size=centers.shape)
+    start_parameters = true_parameters + scale * rng.normal(size=true_parameters.shape)
+    problem = Problem.build(
+        Pose(start.as_quat(scalar_first=True), -start.apply(start_centers)),
+        type(camera)(*start_parameters.T),
+        points + 0.03 * rng.normal(size=points.shape),
+        Observations(xy_px, rng.uniform(0.4, 0.8, len(xy_px)), image_index, point_index),
+        camera_index=camera_index,
+        priors=priors,
+        lever_arm=measured_arm,
+    )
+    return eqx.tree_at(lambda p: p.free.lever_arm, problem, np.array(lever_arm))

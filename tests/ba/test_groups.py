@@ -1,0 +1,157 @@
+"""Every residual group: values by their formulas, derivatives those of `jax.jacfwd`, padding that does no harm."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from dense_reference import start_of
+from jax import Array
+from scipy.spatial.transform import Rotation
+from small_problems import EVERY_CAMERA, small_problem
+
+from jaxba.ba import AttitudePrior, Step, Unknowns
+from jaxba.ba._problem import AbstractPrior
+from jaxba.ba.groups import PRIORS, Reprojection
+
+PROBLEM = small_problem(EVERY_CAMERA[3], num_cameras=2, lever_arm=True)
+UNKNOWNS = start_of(PROBLEM)
+
+
+def no_step(unknowns: Unknowns) -> Step:
+    poses = jnp.zeros((unknowns.poses.translation.shape[0], 6))
+    return Step(poses, *(jnp.zeros_like(x) for x in (unknowns.intrinsics, unknowns.lever_arm, unknowns.points)))
+
+
+def assert_rows_equal_jacfwd(prior: AbstractPrior, unknowns: Unknowns, tolerance: float = 1e-12) -> None:
+    def residual(step: Step) -> Array:
+        return prior.residual(unknowns.retract(step))
+
+    expected = jax.jit(jax.jacfwd(residual))(no_step(unknowns))
+    rows = jax.jit(prior.rows)(unknowns)
+    np.testing.assert_allclose(rows.residual, prior.residual(unknowns), rtol=0, atol=1e-12)
+    numbers = np.arange(rows.residual.shape[1])
+    for block, index, whole in (
+        (rows.pose, rows.pose_index, expected.poses),
+        (rows.intrinsics, rows.camera_index, expected.intrinsics),
+        (rows.point, rows.point_index, expected.points),
+    ):
+        dense = np.zeros(whole.shape)
+        if block is not None:
+            dense[:, numbers, np.asarray(index)] = np.moveaxis(block, 1, 2)
+        # 1e-12 of the largest entry: rounding of two orders of summation
+        np.testing.assert_allclose(dense, whole, rtol=0, atol=tolerance * max(1.0, np.abs(whole).max()))
+    lever_arm = np.zeros(expected.lever_arm.shape) if rows.lever_arm is None else np.moveaxis(rows.lever_arm, 1, 2)
+    np.testing.assert_allclose(lever_arm, expected.lever_arm, rtol=0, atol=1e-12 * max(1.0, np.abs(lever_arm).max()))
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_derivatives_of_every_prior_equal_jacfwd(name):
+    assert_rows_equal_jacfwd(PROBLEM.prior(name), UNKNOWNS)
+
+
+# about half a turn the rotation vector jumps; beside it the derivative of arctan2 loses four digits
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, np.pi - 1e-6, np.pi - 1e-3])
+def test_derivatives_of_an_attitude_equal_jacfwd_from_no_turn_to_half_a_turn(angle):
+    axes = np.array([[1.0, 0, 0], [0, 0.6, -0.8], [0.48, 0.6, 0.64]])
+    adjusted = Rotation.from_quat(np.array(UNKNOWNS.poses.quaternion)[:3], scalar_first=True)
+    measured = Rotation.from_rotvec(-angle * axes) * adjusted
+    prior = AttitudePrior(np.arange(3), measured.as_quat(scalar_first=True), np.array([[0.01, 0.02, 0.03]] * 3))
+    assert_rows_equal_jacfwd(prior, UNKNOWNS, tolerance=1e-9)
+    expected = (angle * axes).T / np.array([[0.01], [0.02], [0.03]])
+    np.testing.assert_allclose(prior.residual(UNKNOWNS), expected, rtol=0, atol=1e-7)
+
+
+def test_residuals_of_priors_equal_their_formulas():
+    rotation = Rotation.from_quat(np.array(UNKNOWNS.poses.quaternion), scalar_first=True)
+    position, attitude, control = (PROBLEM.prior(name) for name in ("position", "attitude", "control"))
+    centers = rotation.inv().apply(np.array(UNKNOWNS.lever_arm) - np.array(UNKNOWNS.poses.translation))
+    expected = {
+        "position": (centers[position.image_index] - position.xyz) / position.std_m,
+        "attitude": (
+            rotation[attitude.image_index] * Rotation.from_quat(attitude.quaternion, scalar_first=True).inv()
+        ).as_rotvec()
+        / attitude.std_rad,
+        "control": (np.asarray(UNKNOWNS.points)[control.point_index] - control.xyz) / control.std_m,
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(PROBLEM.prior(name).residual(UNKNOWNS).T, values, rtol=0, atol=1e-9)
+
+
+def reprojection(camera, refined: tuple[bool, ...]) -> tuple[Reprojection, Unknowns]:
+    """Two runs of four observations of two cameras; one point on the optical axis, one behind, the last row padding."""
+    rng = np.random.default_rng(0)
+    quaternion = np.concatenate([Rotation.random(2, rng=rng).as_quat(scalar_first=True), [[1.0, 0, 0, 0]]])
+    translation = np.concatenate([rng.normal(size=(2, 3)), np.zeros((1, 3))])
+    in_cam = np.array([[1.0, -2, 6], [0, 0, 5], [-2, 1, 7], [1, 1, 8]])
+    in_cam = np.concatenate([in_cam, in_cam[[0, 2, 3, 3]]])
+    if camera.sees_behind:
+        in_cam[3, 2] = -2.0
+    run_image = np.array([0, 1], np.int32)
+    of_row = np.repeat(run_image, 4)
+    rotation = Rotation.from_quat(quaternion, scalar_first=True)
+    points = rotation[of_row].inv().apply(in_cam - translation[of_row])
+    points[7] = rotation[1].inv().apply(-translation[1])  # padding may lie anywhere, even in the camera's centre
+    names = camera.parameter_names()
+    parameters = np.array([[float(getattr(camera, n)) * scale for n in names] for scale in (1.0, 1.1)])
+    weight = rng.uniform(1, 2, 8)
+    weight[7] = 0.0
+    group = Reprojection(
+        xy_px=jnp.asarray(rng.uniform(0, 500, (2, 2, 4))),
+        weight=jnp.asarray(weight.reshape(2, 4)),
+        point_index=jnp.arange(8, dtype=jnp.int32).reshape(2, 4),
+        run_image=jnp.asarray(run_image),
+        camera_index=jnp.array([1, 0, 0], jnp.int32),
+        model=type(camera),
+        refined=refined,
+    )
+    values = quaternion, translation, parameters, np.zeros(3), points
+    poses, *rest = (jnp.asarray(v) for v in values)
+    return group, Unknowns(type(PROBLEM.poses)(poses, rest[0]), *rest[1:])
+
+
+@pytest.mark.parametrize("camera", EVERY_CAMERA, ids=lambda camera: type(camera).__name__)
+def test_derivatives_of_every_camera_equal_jacfwd_with_padding_and_beside_the_axis(camera):
+    refined = tuple(i != 1 for i in range(len(camera.parameter_names())))
+    group, unknowns = reprojection(camera, refined)
+
+    def residual(step: Step) -> Array:
+        return group.residual(unknowns.retract(step))[0]
+
+    @jax.jit
+    def both(step: Step) -> tuple[Array, Step, Array, Step]:
+        pull = jax.vjp(residual, step)[1]
+        return residual(step), jax.jacfwd(residual)(step), group.rows(unknowns), pull(jnp.ones((2, 2, 4)))[0]
+
+    value, expected, rows, reverse = both(no_step(unknowns))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((value, expected, rows, reverse)))
+    assert np.all(np.asarray(value)[:, 1, 3] == 0) and np.all(np.asarray(rows)[1, :, :, 3] == 0)
+
+    runs, lanes = np.repeat([0, 1], 4), np.tile(np.arange(4), 2)
+    camera_of_row = np.asarray(group.camera_index)[runs]
+    columns = [
+        np.asarray(expected.poses)[:, runs, lanes, runs],
+        np.asarray(expected.intrinsics)[:, runs, lanes, camera_of_row][..., list(refined)],
+        np.asarray(value)[:, runs, lanes, None],
+        np.asarray(expected.points)[:, runs, lanes, np.arange(8)],
+    ]
+    # (2, 8, columns) as rows have it; 1e-12 of the largest entry: rounding of two orders of multiplication
+    found = np.moveaxis(np.asarray(rows)[runs, :, :, lanes], 0, 1)
+    whole = np.concatenate(columns, axis=-1)
+    np.testing.assert_allclose(found, whole, rtol=1e-11, atol=1e-12 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_rows_of_infinite_sigma_weigh_nothing_and_keep_derivatives_finite(name):
+    prior = PROBLEM.prior(name)
+    sigma = next(field for field in ("std_m", "std_rad", "std") if hasattr(prior, field))
+    padded = jax.tree.map(lambda a: a, prior)
+    object.__setattr__(padded, sigma, np.full_like(getattr(prior, sigma), np.inf))
+    assert np.all(padded.residual(UNKNOWNS) == 0)
+    rows = padded.rows(UNKNOWNS)
+    assert all(
+        np.all(block == 0)
+        for block in (rows.residual, rows.pose, rows.intrinsics, rows.lever_arm, rows.point)
+        if block is not None
+    )
+    gradient = jax.grad(lambda step: jnp.sum(padded.residual(UNKNOWNS.retract(step)) ** 2))(no_step(UNKNOWNS))
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))

@@ -1,0 +1,20 @@
+"""Every test runs in float64, with the shapes and types of each annotated function and class checked at run time."""
+
+import os
+from pathlib import Path
+
+import jax
+import jaxtyping
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jaxtyping.install_import_hook("jaxba", "beartype.beartype")  # works only on modules that are not imported yet
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of real data: `JAXBA_DATA`, or `shared/data` beside the project."""
+    path = Path(os.environ.get("JAXBA_DATA") or Path(__file__).parents[2] / "shared" / "data")
+    if not path.is_dir():
+        pytest.skip(f"needs real data, and {path} is no folder; set JAXBA_DATA to it")
+    return path

@@ -1,0 +1,30 @@
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+WANTED = {
+    Requirement(line).name: Requirement(line)
+    for lines in (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())
+    for line in lines
+}
+LOCK = (ROOT / "requirements.lock").read_text()
+LOCKED = re.findall(r"^([\w.-]+)==([\w.]+)", LOCK, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", sorted(WANTED))
+def test_lock_holds_a_version_that_the_project_accepts(name: str):
+    versions = [version for locked, version in LOCKED if locked == name]
+    assert versions, f"{name} is missing; make requirements.lock anew as its first lines say"
+    assert all(version in WANTED[name].specifier for version in versions)
+
+
+def test_every_locked_version_has_hashes_and_no_address():
+    pins = re.findall(r"^[\w.-]+==(?:.*\\\n)+.*\n", LOCK, re.MULTILINE)
+    assert len(pins) == len(LOCKED)
+    assert all("--hash=sha256:" in pin for pin in pins)
+    assert "//" not in LOCK

@@ -3,6 +3,7 @@
 Imports happen in the functions, so that each process loads one side's libraries only and memory is each side's own.
 """
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable
@@ -36,20 +37,22 @@ def solve_with_jaxba(problem: Problem, loss: AbstractLoss, *, max_nfev: int = 10
     last step.
     """
     import jaxba
-    from jaxba.ba import solve
 
     start = time.perf_counter()
-    solution = solve(problem, loss=loss, max_nfev=max_nfev)
-    seconds_total = time.perf_counter() - start - solution.seconds_compile
+    solution = jaxba.ba.solve(problem, loss=loss, max_nfev=max_nfev)
+    report = solution.report
+    assert report is not None  # the problem is concrete
+    seconds_total = time.perf_counter() - start - report.seconds_compile
+    last = report.history[-1]
     return Record(
         solver=f"jaxba {jaxba.__version__}",
-        initial_cost=solution.history[0]["cost"],
-        final_cost=solution.final_cost,
-        history=solution.history,
-        seconds_preprocess=max(0.0, seconds_total - solution.history[-1]["seconds"]),
-        seconds_compile=solution.seconds_compile,
+        initial_cost=float(solution.initial_cost),
+        final_cost=float(solution.final_cost),
+        history=[dataclasses.asdict(step) for step in report.history],
+        seconds_preprocess=max(0.0, seconds_total - last.seconds),
+        seconds_compile=report.seconds_compile,
         seconds_total=seconds_total,
-        termination=str(solution.result),
-        num_iterations=len(solution.history) - 1,
-        values=Values.of(solution.problem),
+        termination=solution.result,
+        num_iterations=last.step,
+        values=Values.of(solution.apply(problem)),
     )

@@ -1,7 +1,7 @@
 """Compile a solver's functions for the shapes of a system, once a process.
 
-`jax.jit` keeps what it has compiled, but does not tell a first call's compile time from its running time; here the two are
-apart. jax's persistent cache, where it is switched on, keeps the result across processes.
+`jax.jit` keeps what it has compiled, but does not tell a first call's compile time from its running time; here the two
+are apart. jax's persistent cache, where it is switched on, keeps the result across processes.
 """
 
 import functools
@@ -29,7 +29,7 @@ class Compiled(NamedTuple):
 
 
 def compiled(solver: AbstractSchurSolver, unknowns: Unknowns, system: System, plain: System) -> Compiled:
-    """Return the solver's functions, compiled for these arguments' shapes; `plain` is the system without robust losses."""
+    """Return the solver's functions for these arguments' shapes; `plain` is the system without robust losses."""
     leaves, structure = jax.tree.flatten((unknowns, system, plain))
     shapes = tuple((leaf.shape, leaf.dtype.name) for leaf in leaves)
     return _compile(solver, structure, shapes)

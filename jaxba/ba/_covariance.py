@@ -1,47 +1,30 @@
 """Covariance: marginal covariances of poses, intrinsics, lever arm and points at a problem's present values.
 
-With the points eliminated, S = [A B; B^T C] is the reduced system without damping (`_schur.py`), over images and the
-border of shared unknowns. Its inverse holds the covariances of both,
+The blocks of (J^T J)^-1 that belong to one image, camera or point; how they are computed stands in `_marginals.py`.
+Poses are tangent steps (w in rad, v in metres) in the camera's frame, as `Pose.retract` takes them.
 
-    S^-1 = [A^-1 + F G^-1 F^T   -F G^-1]       F = A^-1 B       G = C - B^T F
-           [ .                    G^-1 ]
-
-and each point's follows from its own observations: with V = L L^T and Z_i as in `_schur.py`,
-
-    cov_x = V^-1 + V^-1 W^T S^-1 W V^-1 = L^-T (I + sum over pairs of observations i, j of  Z_i S^-1_ij Z_j^T) L^-1
-
-in which the border counts as one more block. Poses are tangent steps (w in rad, v in metres) in the camera's frame.
-
-Cost: A^-1 is dense. 500 images with 33k points take 0.9 s on two cores, and 0.3 GB beside what is loaded; points are
-summed in pieces of `_CHUNK` pairs.
+Cost: 500 images with 33k points take 0.9 s on two cores, after 5 s to compile, and 0.3 GB beside what is loaded.
 """
 
 import dataclasses
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._check import Dropped, prepare
-from jaxba.ba._factor import factor_solve, factorise
 from jaxba.ba._gauge import require_gauge
-from jaxba.ba._linearise import Linearisation, linearise
+from jaxba.ba._marginals import Marginals, marginals
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import rotation_matrices
 from jaxba.ba._rows import Unknowns
-from jaxba.ba._schur import Reduced, eliminate_points
 from jaxba.ba._system import System, initial_unknowns, make_system
 from jaxba.geometry import AbstractLoss, Linear
 
-MAX_UNKNOWNS = 6000  # A^-1 and its copies take 1.2 GB there
-_CHUNK = 4096
-_COLUMNS = 384  # of A^-1 solved for at a time: keeps one dense matrix in memory, not four
+MAX_UNKNOWNS = 6500  # 1000 images with one camera take 5 s and 0.8 GB beside what is loaded
 _PROBING = 1e-9  # damping, relative, under which a singular system shows where it is weak
 _MAX_INFLATION = 1e13  # of a variance by the other unknowns: beyond it rounding has eaten the answer
 
@@ -95,151 +78,22 @@ def covariance(problem: Problem, *, loss: AbstractLoss | None = None) -> Covaria
     with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
         system: System = jax.device_put(make_system(problem, plan, _as_arrays(Linear() if loss is None else loss)))
         unknowns: Unknowns = jax.device_put(initial_unknowns(problem, plan))
-        marginals = jax.device_get(_marginals(system, plan, unknowns, np.float64(0.0)))
-        if not _determined(marginals):
-            damped = _marginals(system, plan, unknowns, np.float64(_PROBING))
+        found = jax.device_get(marginals(system, plan, unknowns, np.array(0.0)))
+        if not _determined(found):
+            damped = marginals(system, plan, unknowns, np.array(_PROBING))
             weakest = _weakest(jax.device_get(damped), plan, problem)
             raise JaxbaError(
                 f"Covariance: the measurements do not determine {weakest}. Hold it fixed or add a prior; an image "
                 "needs three points or more that others see, and intrinsics need views from different heights or sides."
             )
-    return _in_order(marginals, plan, problem, prepared.dropped)
+    return _in_order(found, plan, problem, prepared.dropped)
 
 
-class _Marginals(eqx.Module):
-    """Covariances in the solver's order, padding included."""
-
-    blocks: Float[Array, "images block block"]
-    border: Float[Array, "border border"]
-    points: Float[Array, "points 3 3"]
-    block_inflation: Float[Array, "images block"]
-    border_inflation: Float[Array, " border"]
-    double_cost: Float[Array, ""]
-    num_rows: Float[Array, ""]
-
-
-@eqx.filter_jit
-def _marginals(system: System, plan: Plan, unknowns: Unknowns, damping: Float[Array, ""]) -> _Marginals:
-    model = linearise(system, unknowns)
-    reduced = eliminate_points(system, model, jax.tree.map(lambda d: damping * d, model.diagonal))
-    inverse, cross, corner = _inverse(system, reduced)
-    images = jnp.arange(system.shape.num_images)
-    blocks = inverse[images, :, images]
-    diagonal = jnp.diagonal(reduced.diagonal, axis1=1, axis2=2)
-    double_cost, num_rows = _sum_of_losses(system, plan, unknowns, model)
-    return _Marginals(
-        blocks=blocks,
-        border=corner,
-        points=_point_covariances(system, plan, reduced, inverse, cross, corner),
-        block_inflation=jnp.diagonal(blocks, axis1=1, axis2=2) * diagonal,
-        border_inflation=jnp.diagonal(corner) * jnp.diagonal(reduced.corner),
-        double_cost=double_cost,
-        num_rows=num_rows,
-    )
-
-
-def _inverse(system: System, reduced: Reduced) -> tuple[Array, Array, Array]:
-    """Return S^-1: (images block images block), (images block border), (border border)."""
-    shape = system.shape
-    size = shape.num_images * shape.block
-    factor = factorise(system, reduced)
-    through, corner = _border(system, reduced, factor)
-    cross = -jnp.einsum("mbg,gh->mbh", through, corner)
-
-    def piece(carry: None, column: Array) -> tuple[None, Array]:
-        identity = (jnp.arange(size)[:, None] == column).astype(cross.dtype)
-        solved, _ = factor_solve(system, reduced, factor, identity.reshape(shape.num_images, shape.block, _COLUMNS))
-        solved = solved.reshape(size, _COLUMNS)
-        if shape.border:
-            own = jnp.take(through.reshape(size, shape.border), column, axis=0, mode="clip")
-            solved -= cross.reshape(size, shape.border) @ own.T
-        return carry, solved.T
-
-    _, inverse = jax.lax.scan(piece, None, jnp.arange(size + -size % _COLUMNS).reshape(-1, _COLUMNS))
-    inverse = inverse.reshape(-1, size)[:size]
-    return inverse.reshape(shape.num_images, shape.block, shape.num_images, shape.block), cross, corner
-
-
-def _border(system: System, reduced: Reduced, factor: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Return F and G^-1."""
-    if not system.shape.border:
-        return reduced.border, reduced.corner
-    through, _ = factor_solve(system, reduced, factor, reduced.border)
-    corner = reduced.corner - jnp.einsum("mbg,mbh->gh", reduced.border, through)
-    scale = 1 / jnp.sqrt(jnp.diagonal(corner))
-    root = jnp.linalg.cholesky((corner + corner.T) / 2 * scale[:, None] * scale)
-    half = jax.scipy.linalg.solve_triangular(root, jnp.diag(scale), lower=True)
-    return through, half.T @ half
-
-
-def _point_covariances(
-    system: System, plan: Plan, reduced: Reduced, inverse: Array, cross: Array, corner: Array
-) -> Float[Array, "points 3 3"]:
-    shape = system.shape
-    point, image = jnp.asarray(plan.row_point), jnp.asarray(plan.row_image)
-    z, z_shared = reduced.z, reduced.z_shared
-    num_shared = z_shared.shape[-1]
-    cross, corner = cross[:, :, :num_shared], corner[:num_shared, :num_shared]  # no observation sees the lever arm
-
-    def pieces(rows: Array) -> Array:
-        last = shape.num_rows - 1  # padding, of weight zero
-        return jnp.pad(rows.reshape(-1), (0, -rows.size % _CHUNK), constant_values=last).reshape(-1, _CHUNK)
-
-    def add_pairs(total: Array, pair: tuple[Array, Array]) -> tuple[Array, None]:
-        first, second = pair
-        between = inverse[image[first], :, image[second]]
-        product = jnp.einsum("nij,njk,nlk->nil", z[first], between, z[second])
-        return total.at[point[first]].add(product), None
-
-    def add_border(total: Array, rows: Array) -> tuple[Array, None]:
-        return total.at[point[rows]].add(jnp.einsum("nij,njk->nik", z[rows], cross[image[rows]])), None
-
-    every = pieces(jnp.arange(shape.num_rows, dtype=jnp.int32))
-    total = jnp.zeros((shape.num_points, 3, 3), z.dtype)
-    if shape.num_blocks:
-        pairs = (pieces(jnp.asarray(plan.pair_first)), pieces(jnp.asarray(plan.pair_second)))
-        total, _ = jax.lax.scan(add_pairs, total, pairs)
-    total, _ = jax.lax.scan(add_pairs, total + jnp.swapaxes(total, 1, 2), (every, every))
-    if num_shared:
-        through, _ = jax.lax.scan(add_border, jnp.zeros_like(z_shared), every)
-        mixed = jnp.einsum("nik,njk->nij", through, z_shared)
-        total += mixed + jnp.swapaxes(mixed, 1, 2)
-        total += jnp.einsum("nik,kl,njl->nij", z_shared, corner, z_shared)
-    root = _lower_triangle(reduced.point_root)
-    covariances = jnp.einsum("nki,nkl,nlj->nij", root, jnp.eye(3, dtype=z.dtype) + total, root)
-    return covariances * system.free.points[:, :1, None]
-
-
-def _lower_triangle(root: Float[Array, "points 6"]) -> Float[Array, "points 3 3"]:
-    """L^-1 as matrices, from (xx, yx, yy, zx, zy, zz)."""
-    rows, columns = np.tril_indices(3)
-    return jnp.zeros((root.shape[0], 3, 3), root.dtype).at[:, rows, columns].set(root)
-
-
-def _sum_of_losses(system: System, plan: Plan, unknowns: Unknowns, model: Linearisation) -> tuple[Array, Array]:
-    """Return twice the cost of the components that depend on something free, and their number."""
-    group, free = system.reprojection, system.free
-    of_image = free.poses[:, 0] + jnp.sum(free.intrinsics[jnp.asarray(group.camera_index)], axis=1)
-    anything = of_image[jnp.asarray(plan.row_image)] + free.points[jnp.asarray(plan.row_point), 0]
-    depends = (anything > 0) & (jnp.asarray(plan.row_observation) >= 0)
-    squared = jnp.sum(group.residual(unknowns)[0].reshape(2, -1) ** 2, axis=0)
-    total, number = jnp.sum(system.loss(jnp.where(depends, squared, 0.0))), 2 * jnp.sum(depends)
-    for prior, rows in zip(system.priors, model.prior_rows, strict=True):
-        residual = prior.residual(unknowns)
-        depends = jnp.zeros(residual.shape, bool)
-        for derivative in (rows.pose, rows.intrinsics, rows.lever_arm, rows.point):
-            if derivative is not None:
-                depends |= jnp.any(derivative != 0, axis=1)
-        total += jnp.sum(prior.loss(jnp.sum(jnp.where(depends, residual, 0.0) ** 2, axis=0)))
-        number += jnp.sum(depends)
-    return total, number
-
-
-def _in_order(marginals: _Marginals, plan: Plan, problem: Problem, dropped: Dropped) -> Covariance:
+def _in_order(found: Marginals, plan: Plan, problem: Problem, dropped: Dropped) -> Covariance:
     """Return the covariances in the problem's order, without padding, zero for what is fixed."""
     shape, free = plan.shape, problem.free
     rank = np.argsort(plan.image_order)
-    blocks = np.asarray(marginals.blocks)[rank]
+    blocks = np.asarray(found.blocks)[rank]
     poses = blocks[:, :6, :6] * np.asarray(free.poses)[:, None, None]
     rotation = rotation_matrices(problem.poses)
     centers = np.swapaxes(rotation, 1, 2) @ poses[:, 3:, 3:] @ rotation
@@ -250,7 +104,7 @@ def _in_order(marginals: _Marginals, plan: Plan, problem: Problem, dropped: Drop
     free_intrinsics = np.asarray(free.intrinsics)
     shared_free = np.zeros(0, bool) if shape.own_cameras else free_intrinsics[:, refined].reshape(-1)
     border_free = np.append(shared_free, np.ones(shape.border - num_shared, bool))
-    border = np.asarray(marginals.border) * np.outer(border_free, border_free)
+    border = np.asarray(found.border) * np.outer(border_free, border_free)
     intrinsics = np.zeros((num_cameras, len(names), len(names)))
     if shape.own_cameras:
         intrinsics[np.ix_(np.asarray(problem.camera_index), refined, refined)] = blocks[:, 6:, 6:]
@@ -259,16 +113,16 @@ def _in_order(marginals: _Marginals, plan: Plan, problem: Problem, dropped: Drop
         of_cameras = border[:num_shared, :num_shared].reshape(num_cameras, len(refined), num_cameras, len(refined))
         cameras = np.arange(num_cameras)
         intrinsics[np.ix_(cameras, refined, refined)] = of_cameras[cameras, :, cameras]
-    redundancy = int(marginals.num_rows) - _num_free(problem)
+    redundancy = int(found.num_rows) - _num_free(problem)
     return Covariance(
         poses=poses,
         centers=centers,
         intrinsics=intrinsics,
         lever_arm=border[num_shared:, num_shared:] if shape.lever_arm else np.zeros((3, 3)),
-        points=np.asarray(marginals.points)[np.argsort(plan.point_order)],
+        points=np.asarray(found.points)[np.argsort(plan.point_order)],
         border=border,
         border_names=_border_names(plan, problem),
-        variance_factor=float(marginals.double_cost) / redundancy if redundancy > 0 else np.nan,
+        variance_factor=float(found.double_cost) / redundancy if redundancy > 0 else np.nan,
         redundancy=redundancy,
         dropped=dropped,
     )
@@ -298,12 +152,12 @@ def _check_size(plan: Plan) -> None:
         )
 
 
-def _determined(marginals: _Marginals) -> bool:
-    inflation = np.append(np.ravel(marginals.block_inflation), marginals.border_inflation)
-    return bool(np.isfinite(marginals.points).all() and np.max(inflation, initial=0.0) < _MAX_INFLATION)
+def _determined(found: Marginals) -> bool:
+    inflation = np.append(np.ravel(found.block_inflation), found.border_inflation)
+    return bool(np.isfinite(found.points).all() and np.max(inflation, initial=0.0) < _MAX_INFLATION)
 
 
-def _weakest(damped: _Marginals, plan: Plan, problem: Problem) -> str:
+def _weakest(damped: Marginals, plan: Plan, problem: Problem) -> str:
     """Name the unknown whose variance the others inflate most, from a system damped until it has an inverse."""
     of_images = np.asarray(damped.block_inflation)[: len(plan.image_order)]
     of_border = np.asarray(damped.border_inflation)

@@ -1,13 +1,14 @@
 """Factor and solve the reduced system [A B; B^T C], A block-sparse over images, B and C a dense border.
 
-A is factored as L L^T once, then `A^-1 [B, a]` gives the border's own small system, which also takes the bounds. Three ways:
+A is factored as L L^T once, then `A^-1 [B, a]` gives the border's own small system, which also takes the bounds. Three
+ways:
 
 - dense: one LAPACK Cholesky, n^3/3 flops. Best up to some 1500 unknowns.
-- banded: images stand in an order that keeps A near its diagonal (`_plan.py`). Panels of about 48 unknowns; a scan factors
-  one panel, updates the window of the band below it, and moves on: 2 n b^2 flops for half-bandwidth b, nearly all of them
-  in matrix products. n = 12000, b = 600 (2000 images) takes 0.11 s where dense takes several seconds.
-- cg: conjugate gradients on the explicit blocks, preconditioned by A's block diagonal. For systems whose band does not fit
-  in memory.
+- banded: images stand in an order that keeps A near its diagonal (`_plan.py`). Panels of about 48 unknowns; a scan
+  factors one panel, updates the window of the band below it, and moves on: 2 n b^2 flops for half-bandwidth b, nearly
+  all of them in matrix products. n = 12000, b = 600 (2000 images) takes 0.11 s where dense takes several seconds.
+- cg: conjugate gradients on the explicit blocks, preconditioned by A's block diagonal. For systems whose band does not
+  fit in memory.
 """
 
 from typing import NamedTuple
@@ -98,8 +99,8 @@ def box_minimum(
 ) -> Float[Array, " n"]:
     """Return the x within the bounds that minimises `x^T M x / 2 - rhs^T x`, by the primal-dual active set method.
 
-    Hintermueller, Ito and Kunisch 2002: hold what lies beyond a bound or is pressed against it, solve for the rest, repeat
-    until nothing changes; a handful of small solves. Without bounds, one solve.
+    Hintermueller, Ito and Kunisch 2002: hold what lies beyond a bound or is pressed against it, solve for the rest,
+    repeat until nothing changes; a handful of small solves. Without bounds, one solve.
     """
     scale = 1 / jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), jnp.finfo(matrix.dtype).tiny))
 

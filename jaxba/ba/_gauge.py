@@ -95,6 +95,8 @@ def _normal_matrices(
         if not problem.free.lever_arm and not _null(normal[:, :7, :7])[1].any():
             break  # all is held already: the other priors need not be compiled
         rows = _derivatives(prior, problem)
+        if rows is None:
+            continue
         if rows.pose is None and rows.point is None:
             if rows.lever_arm is not None:
                 lever = np.asarray(rows.lever_arm).reshape(-1, 3)
@@ -118,7 +120,7 @@ def _normal_matrices(
 
 
 def _fixed_point_grams(problem: Problem, parts: Parts) -> Float[np.ndarray, "parts 7 7"]:
-    """Return the mean of A^T A over the fixed points that each part sees, `A = [I, -hat(x), x]`, from means of x, x x^T.
+    """Return A^T A over the fixed points that each part sees, `A = [I, -hat(x), x]`, from the means of x and x x^T.
 
     Points held fixed may be half a million, where A itself would take a second.
     """
@@ -174,12 +176,15 @@ def _names(null: Float[np.ndarray, "free columns"]) -> list[str]:
     return names
 
 
-def _derivatives(prior: AbstractPrior, problem: Problem) -> Rows:
-    """Return a prior's rows by poses, points and the lever arm, numpy; evaluated on pieces of one size."""
+def _derivatives(prior: AbstractPrior, problem: Problem) -> Rows | None:
+    """Return a prior's rows by poses, points and the lever arm, numpy; evaluated on pieces of one size.
+
+    None for a prior of cameras, or without rows.
+    """
     fields = {f.name: getattr(prior, f.name) for f in dataclasses.fields(prior)}
     index_name = next((name for name in fields if name.endswith("_index")), "")
     if index_name == "camera_index" or (index_name and len(fields[index_name]) == 0):
-        return Rows(residual=np.zeros((0, 0)))  # pyright: ignore[reportArgumentType]
+        return None
     with jax.enable_x64(True):
         if not index_name:
             rows = _of_geometry(prior, _unknowns(problem, np.zeros(1, int), np.zeros(1, int)))

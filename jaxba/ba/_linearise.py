@@ -6,8 +6,8 @@ They are kept in the blocks that bundle adjustment has, none of which depends on
 - for each observation, W: its point's columns times its image's block (3 x block);
 - for each point, its columns times [refined intrinsics | residual | point].
 
-The derivatives themselves are never stored: they are computed a few thousand rows at a time, in the cache. For 147k rows
-they would take 42 MB, and to touch that much fresh memory costs more time than the derivatives.
+The derivatives themselves are never stored: they are computed a few thousand rows at a time, in the cache. For 147k
+rows they would take 42 MB, and to touch that much fresh memory costs more time than the derivatives.
 """
 
 import functools
@@ -34,7 +34,8 @@ class Linearisation(eqx.Module):
     - `image_products`: of the columns pose (6), refined intrinsics (k), residual (1).
     - `w`: W of each row.
     - `point_products`: the points' 3x3 blocks.
-    - `point_shared`: each point's block with the shared intrinsics, all cameras side by side; none if they are own ones.
+    - `point_shared`: each point's block with the shared intrinsics, all cameras side by side; none if they are own
+      ones.
     - `gradient`, `diagonal`: J^T r and the diagonal of J^T J, of all groups.
     """
 
@@ -60,7 +61,7 @@ def cost(system: System, unknowns: Unknowns) -> Float[Array, ""]:
 
 
 def point_costs(system: System, unknowns: Unknowns) -> Float[Array, " points"]:
-    """Return twice the cost that each point takes part in: its observations and, for control points, its coordinates."""
+    """Return twice the cost that each point takes part in: its observations and, if surveyed, its coordinates."""
     residual, depth = system.reprojection.residual(unknowns)
     of_rows = system.loss(residual[0] ** 2 + residual[1] ** 2)
     valid = jnp.isfinite(of_rows)

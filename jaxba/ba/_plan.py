@@ -3,11 +3,12 @@
 Made once on the host, in numpy, from who sees what: the order of the images, the order and padding of the observations,
 the pairs of observations that couple two images through a point, the shape of the reduced system and how to solve it.
 
-**Order.** Images are ordered so that the reduced system is narrow around its diagonal; the observations are sorted by image and each image's are padded to whole runs of `ROW_RUN`, so that sums over
-an image are sums over contiguous runs; points are sorted by the first image that sees them.
+**Order.** Images are ordered so that the reduced system is narrow around its diagonal; the observations are sorted by
+image and each image's are padded to whole runs of `ROW_RUN`, so that sums over an image are sums over contiguous runs;
+points are sorted by the first image that sees them.
 
-**Pairs.** An off-diagonal block (i, j) of the reduced system is a sum over the points that images i and j share. The pairs
-of observations of one block form runs of `PAIR_RUN`, padded with a row of zeros: a small matrix product a run.
+**Pairs.** An off-diagonal block (i, j) of the reduced system is a sum over the points that images i and j share. The
+pairs of observations of one block form runs of `PAIR_RUN`, padded with a row of zeros: a small matrix product a run.
 
 **Shapes.** Compiling costs seconds, so every count is rounded up to one of eight sizes an octave. What is added weighs
 nothing and has finite derivatives: observations of weight zero, points and images that nothing sees.
@@ -48,7 +49,7 @@ class Shape:
     refined: tuple[bool, ...]
     """Which of the camera model's parameters are free in any camera."""
     own_cameras: bool
-    """Each image has its own camera, eliminated with the pose; else the intrinsics are a border shared by all images."""
+    """Each image has its own camera, eliminated with the pose; else the intrinsics are a shared border."""
     lever_arm: bool
     any_fixed_pose: bool
     any_fixed_point: bool
@@ -91,7 +92,7 @@ class Plan(eqx.Module):
     row_point: Int[np.ndarray, " rows"]
     pair_first: Int[np.ndarray, "chunks pair_chunk pair_run"]
     pair_second: Int[np.ndarray, "chunks pair_chunk pair_run"]
-    """Rows of each pair; the first one's image comes later in the order. Padding points to the last row, of weight zero."""
+    """Rows of each pair; the first one's image comes later in the order. Padding is the last row, of weight zero."""
     pair_block: Int[np.ndarray, " pair_runs"]
     block_row: Int[np.ndarray, " blocks"]
     block_column: Int[np.ndarray, " blocks"]
@@ -266,7 +267,7 @@ def _layout_rows(
 def _pairs(
     row_image: Int[np.ndarray, " rows"], row_point: Int[np.ndarray, " rows"], rows: Int[np.ndarray, " n"], num_images: int
 ) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
-    """Return every pair of rows that see one point from two images, sorted by block: (later row, earlier row, block)."""
+    """Return all pairs of rows that see one point from two images, by block: (later row, earlier row, block)."""
     rows = rows[np.argsort(row_point[rows], kind="stable")]  # by point, images ascending within
     points = row_point[rows]
     starts = np.flatnonzero(np.diff(points, prepend=-1))

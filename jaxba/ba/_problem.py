@@ -49,7 +49,7 @@ class AbstractPrior(eqx.Module):
 
     @abc.abstractmethod
     def rows(self, unknowns: Unknowns) -> Rows:
-        """Return residuals and exact derivatives; equal to `jax.jacfwd` of `residual` (a test holds every group to it)."""
+        """Return residuals and exact derivatives, equal to `jax.jacfwd` of `residual`."""
 
 
 class Free(eqx.Module):

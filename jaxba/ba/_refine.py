@@ -1,13 +1,13 @@
 """Refine points: move each point, poses and cameras held, to a lower cost of its own observations.
 
-A robust loss turns a point with a wrong match into a hard problem of its own, three unknowns in size; in the joint step such
-points either spoil it or creep. A few sweeps of Levenberg-Marquardt on every point separately, each with its own damping,
-solve them at a tenth of a joint step's cost ("embedded point iterations", Jeong et al. 2010; Ceres's inner iterations).
-Huber on 100 images with 2% outliers: within 0.1% of the optimum after 4 joint steps, 21 without. Least squares gains less (9
-steps become 6 on a problem of 49 images) and gets fewer sweeps.
+A robust loss turns a point with a wrong match into a hard problem of its own, three unknowns in size; in the joint step
+such points either spoil it or creep. A few sweeps of Levenberg-Marquardt on every point separately, each with its own
+damping, solve them at a tenth of a joint step's cost ("embedded point iterations", Jeong et al. 2010; Ceres's inner
+iterations). Huber on 100 images with 2% outliers: within 0.1% of the optimum after 4 joint steps, 21 without. Least
+squares gains less (9 steps become 6 on a problem of 49 images) and gets fewer sweeps.
 
-While steps still change the cost much, sweeps use reweighted least squares, which is safe far from the optimum; afterwards most
-of the loss's curvature, which is fast near it.
+While steps still change the cost much, sweeps use reweighted least squares, which is safe far from the optimum;
+afterwards most of the loss's curvature, which is fast near it.
 """
 
 import equinox as eqx

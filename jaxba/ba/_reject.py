@@ -1,8 +1,8 @@
 """Rounds of solve and reject: observations beyond median + factor x MAD are left out, and the rest is solved again.
 
-The threshold is the one surveyors know from other programs: the median of the reprojection errors in pixels plus `mad_factor`
-times their median absolute deviation, not scaled. Each round judges all observations anew, so one that was left out comes back
-if it fits after all.
+The threshold is the one surveyors know from other programs: the median of the reprojection errors in pixels plus
+`mad_factor` times their median absolute deviation, not scaled. Each round judges all observations anew, so one that was
+left out comes back if it fits after all.
 """
 
 import dataclasses

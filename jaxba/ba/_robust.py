@@ -1,13 +1,13 @@
 """Robust reweighting of residuals and their derivatives.
 
-With s = |r|^2 of a row and loss rho(s), the row enters the normal equations as in Triggs et al. 2000 (section 4.3), which
-keeps the curvature of rho along r:
+With s = |r|^2 of a row and loss rho(s), the row enters the normal equations as in Triggs et al. 2000 (section 4.3),
+which keeps the curvature of rho along r:
 
     r~ = sqrt(rho') / (1 - alpha) r        J~ = sqrt(rho') (I - alpha r r^T / s) J
 
-with alpha the smaller root of `alpha^2 / 2 - alpha - rho'' s / rho' = 0`. `J~^T r~ = rho' J^T r` is the exact gradient for any
-alpha, so alpha is free to be held below `bend`: 0 is iteratively reweighted least squares, a safe overestimate of the
-curvature far from the optimum, 1 the full curvature, fast near it.
+with alpha the smaller root of `alpha^2 / 2 - alpha - rho'' s / rho' = 0`. `J~^T r~ = rho' J^T r` is the exact gradient
+for any alpha, so alpha is free to be held below `bend`: 0 is iteratively reweighted least squares, a safe overestimate
+of the curvature far from the optimum, 1 the full curvature, fast near it.
 """
 
 import functools

@@ -43,8 +43,8 @@ class Unknowns(eqx.Module):
 class Rows(eqx.Module):
     """Residuals of a prior over their sigmas, and their derivatives by the blocks that each row touches.
 
-    Rows have as many components as the prior measures (3 for a position). A block that the prior does not touch is None;
-    `*_index` says which pose, camera or point each row touches.
+    Rows have as many components as the prior measures (3 for a position). A block that the prior does not touch is
+    None; `*_index` says which pose, camera or point each row touches.
     """
 
     residual: Float[Array, "components rows"]
@@ -58,7 +58,7 @@ class Rows(eqx.Module):
 
 
 def rows_of(values: Array, index: Int[Array, "..."]) -> Array:
-    """Gather along the first axis. Indices are checked on the host; jax's own check of each costs more than the gather."""
+    """Gather along the first axis. The host has checked the indices; jax's own check costs more than the gather."""
     return jnp.asarray(values).at[index].get(mode="promise_in_bounds")
 
 

@@ -1,7 +1,7 @@
 """Schur reduction: eliminate the points of the damped normal equations, and put them back.
 
-With V_p the damped 3x3 block of point p, V_p = L L^T, W an observation's block with its image and W_k,p the point's with the
-shared border,
+With V_p the damped 3x3 block of point p, V_p = L L^T, W an observation's block with its image and W_k,p the point's
+with the shared border,
 
     Z = L^-1 W  (3xb)        Z_k,p = L^-1 W_k,p  (3xg)
 
@@ -10,8 +10,8 @@ the reduced system over images and border, U, B and C the blocks that were there
     S_ij = -sum over pairs Z_i^T Z_j                      S_ii = U_i - sum Z^T Z
     B_i  = B_i - sum Z^T Z_k,p                            C    = C - sum Z_k,p^T Z_k,p
 
-plus the priors and the damping. Sums over an image are batched products of runs of rows; sums over pairs are products of
-short runs gathered a few at a time, so that they stay in the cache: 188k pairs of 500 images take 10 ms, where one
+plus the priors and the damping. Sums over an image are batched products of runs of rows; sums over pairs are products
+of short runs gathered a few at a time, so that they stay in the cache: 188k pairs of 500 images take 10 ms, where one
 product a pair takes 56 ms. Right-hand sides and back-substitution read Z alone.
 """
 
@@ -199,16 +199,11 @@ def _sum_pairs(system: System, z: Float[Array, "rows 3 block"]) -> Float[Array, 
 
     def chunk(_: None, pairs: tuple[Array, Array]) -> tuple[None, Array]:
         first, second = (rows_of(z, p).reshape(p.shape[0], -1, shape.block) for p in pairs)
-        return None, _run_products(first, second)
+        return None, jnp.einsum("rka,rkb->rab", first, second)
 
     _, runs = jax.lax.scan(chunk, None, (system.pair_first, system.pair_second))
     runs = runs.reshape(-1, shape.block, shape.block)
     return -jax.ops.segment_sum(runs, system.pair_block, num_segments=shape.num_blocks, indices_are_sorted=True, mode="promise_in_bounds")
-
-
-def _run_products(first: Float[Array, "runs k a"], second: Float[Array, "runs k b"]) -> Float[Array, "runs a b"]:
-    # a broadcast product and a sum over k: XLA fuses them into vector code; its batched dot is slower on such sizes
-    return jnp.sum(first[:, :, :, None] * second[:, :, None, :], axis=1)
 
 
 def _add_prior(

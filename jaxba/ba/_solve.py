@@ -1,8 +1,9 @@
 """`solve`: adjust a problem from its start values.
 
-On concrete values a host loop calls the solver's compiled `init` and `step`: it reports progress, can be interrupted with what
-was reached kept, and times every step without the compile. With traced values (inside `jit`, `vmap` or a derivative) the same
-solver runs in `optimistix.least_squares`; the structure must then be known beforehand, as a `Plan` made with `make_plan`.
+On concrete values a host loop calls the solver's compiled `init` and `step`: it reports progress, can be interrupted
+with what was reached kept, and times every step without the compile. With traced values (inside `jit`, `vmap` or a
+derivative) the same solver runs in `optimistix.least_squares`; the structure must then be known beforehand, as a `Plan`
+made with `make_plan`.
 """
 
 import time
@@ -55,13 +56,13 @@ def solve(
     - `loss`: robust loss of the reprojections, in units of their sigma; least squares if None. Priors carry their own.
     - `method`: `lm`, Levenberg-Marquardt, or `dogleg`.
     - `linear_solver`: how the reduced system is solved; `auto` chooses from its size and bandwidth.
-    - `max_nfev`: the most steps tried. `ftol`, `xtol`, `gtol`: stop when the cost, the unknowns or the gradient no longer
-      change, as in scipy.
+    - `max_nfev`: the most steps tried. `ftol`, `xtol`, `gtol`: stop when the cost, the unknowns or the gradient no
+      longer change, as in scipy.
     - `plan`: the problem's structure, made by `make_plan`; needed where the problem's values are traced.
     - `callback`: called after every step.
 
-    Raises `JaxbaError` for a problem that cannot be solved, naming what is wrong. What is left out instead (points seen once,
-    points behind their camera) is counted in `solution.report.dropped`. Ctrl-C returns what was reached so far.
+    Raises `JaxbaError` for a problem that cannot be solved, naming what is wrong. What is left out instead (points seen
+    once, points behind their camera) is counted in `solution.report.dropped`. Ctrl-C returns what was reached so far.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(8)
@@ -77,8 +78,8 @@ def solve(
         if plan is None:
             raise JaxbaError("solve inside jit, vmap or a derivative needs plan=jaxba.make_plan(problem), made outside.")
         return _solve_traced(problem, loss, solver, plan, max_nfev)
-    # OpenBLAS's threads fight with XLA's for the cores (with them a 144 x 144 Cholesky took 204 ms instead of 0.16 ms), so
-    # OpenBLAS gets one thread for as long as this runs
+    # OpenBLAS's threads fight with XLA's for the cores (with them a 144 x 144 Cholesky took 204 ms instead of 0.16 ms),
+    # so OpenBLAS gets one thread for as long as this runs
     with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
         return _solve_on_host(problem, loss, solver, plan, linear_solver, max_nfev, dtype, callback)
 

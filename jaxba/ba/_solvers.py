@@ -1,11 +1,12 @@
 """`SchurLevenbergMarquardt` and `SchurDogleg`: optimistix least-squares solvers for bundle adjustment.
 
-Both minimise `residuals(unknowns, system)` with a `System` as `args`: they take derivatives block by block from the system
-itself, never a Jacobian of the whole function, so `optimistix.least_squares(residuals, solver, unknowns, args=system)` is how
-they run under `jit`, `vmap` and differentiation. `jaxba.solve` calls the same `init`, `step` and `terminate` one step at a time.
+Both minimise `residuals(unknowns, system)` with a `System` as `args`: they take derivatives block by block from the
+system itself, never a Jacobian of the whole function, so `optimistix.least_squares(residuals, solver, unknowns,
+args=system)` is how they run under `jit`, `vmap` and differentiation. `jaxba.solve` calls the same `init`, `step` and
+`terminate` one step at a time.
 
-A step is kept when the cost falls by at least `_MIN_RATIO` of what the quadratic model promised. A step that puts a point
-behind a camera or makes anything infinite has infinite cost, so it is refused and the next one is shorter.
+A step is kept when the cost falls by at least `_MIN_RATIO` of what the quadratic model promised. A step that puts a
+point behind a camera or makes anything infinite has infinite cost, so it is refused and the next one is shorter.
 """
 
 import abc
@@ -60,7 +61,7 @@ class Proposal(NamedTuple):
 
 
 def residuals(unknowns: Unknowns, system: System) -> tuple[Float[Array, "components rows"], ...]:
-    """Return the robust residuals of every group, whose squares sum to twice the cost: `sqrt(rho(s) / s) r`, `s = |r|^2`."""
+    """Return every group's robust residuals `sqrt(rho(s) / s) r`, `s = |r|^2`: their squares sum to twice the cost."""
 
     def robust(residual: Array, loss: Callable[[Array], Array]) -> Array:
         squared = jnp.sum(residual**2, axis=0)
@@ -183,7 +184,7 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
 
 
 class SchurLevenbergMarquardt(AbstractSchurSolver):
-    """Levenberg-Marquardt on the Schur complement, damped by `trust * diag(J^T J)` (Marquardt 1963; update as in Ceres)."""
+    """Levenberg-Marquardt on the Schur complement, damped by `trust * diag(J^T J)` (Marquardt 1963)."""
 
     rtol: float = 1e-8
     atol: float = 1e-10
@@ -206,7 +207,7 @@ class SchurLevenbergMarquardt(AbstractSchurSolver):
 
 
 class SchurDogleg(AbstractSchurSolver):
-    """Powell's dogleg: between steepest descent and the Gauss-Newton step, within a radius in units of `sqrt(diag(J^T J))`."""
+    """Powell's dogleg: steepest descent to Gauss-Newton step, within a radius in units of `sqrt(diag(J^T J))`."""
 
     rtol: float = 1e-8
     atol: float = 1e-10
@@ -249,7 +250,7 @@ class SchurDogleg(AbstractSchurSolver):
 
 
 def _damped_step(system: System, unknowns: Unknowns, model: Linearisation, damping: Float[Array, ""]) -> Proposal:
-    """Return the minimiser of the quadratic model plus `damping * d^T diag(J^T J) d / 2`, the border within its bounds."""
+    """Return the minimiser of the model plus `damping * d^T diag(J^T J) d / 2`, the border within its bounds."""
     scaled = jax.tree.map(lambda d: damping * d, _scale(model.diagonal))
     reduced = eliminate_points(system, model, scaled)
     rhs = jax.tree.map(lambda g: -g, model.gradient)

@@ -1,7 +1,7 @@
 """System: a problem in the solver's own order and padded shapes, the one argument of every compiled function.
 
-`make_system` moves values from the problem into the layout of its plan; `initial_unknowns` and `restore` move unknowns in and
-out. On the host this is numpy, so nothing compiles for a shape that is not a bucket's; with tracers it is jax.
+`make_system` moves values from the problem into the layout of its plan; `initial_unknowns` and `restore` move unknowns
+in and out. On the host this is numpy, so nothing compiles for a shape that is not a bucket's; with tracers it is jax.
 """
 
 import dataclasses

@@ -218,5 +218,5 @@ def test_model_that_sees_behind_keeps_what_has_a_pixel():
 
 def test_block_that_looks_the_wrong_way_is_an_error():
     problem = two_views(Pinhole(100.0, 100.0, 50.0, 50.0), [[0, 0, -5], [1, 0, -5]])
-    with pytest.raises(JaxbaError, match="No observation is left of 4: 4 are of points behind .* give cam_from_world"):
+    with pytest.raises(JaxbaError, match=r"No observation is left of 4: 4 are of points behind .* give cam_from_world"):
         prepare(problem)

@@ -1,6 +1,8 @@
 """Free directions equal the null space of a dense Jacobian, and are called what they are."""
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -11,7 +13,7 @@ import pytest
 from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem, Step, Unknowns, free_gauge
 from jaxba.ba._gauge import require_gauge
-from jaxba.ba.groups import AttitudePrior, ControlPointPrior, LeverArmPrior, PositionPrior
+from jaxba.ba.groups import AttitudePrior, ControlPointPrior, IntrinsicsPrior, LeverArmPrior, PositionPrior
 from jaxba.geometry import Pinhole, Pose
 from jaxba.scene import uav_block
 
@@ -53,6 +55,10 @@ def control(
     return ControlPointPrior(point_index=np.array(points), xyz=problem.points[points], std_m=std)
 
 
+def calibration() -> IntrinsicsPrior:
+    return IntrinsicsPrior(camera_index=np.zeros(1, int), parameters=np.ones((1, 4)), std=np.ones((1, 4)))
+
+
 def given(problem: Problem, *priors: object, lever_arm: bool = False) -> Problem:
     free = dataclasses.replace(problem.free, lever_arm=np.array(lever_arm))
     return dataclasses.replace(problem, priors=priors, free=free)
@@ -82,6 +88,8 @@ CASES = {
         ("translation x", "translation y", "rotation about x + rotation about y + scale", "rotation about z"),
     ),
     "plane": (lambda p: given(p, control(p, [3, 8], (0.01, 0.01, np.inf))), None),
+    "calibration": (lambda p: given(p, calibration()), ALL),
+    "no rows": (lambda p: given(p, positions(p, range(0)), attitudes(p, range(1))), (*TRANSLATIONS, "scale")),
     "hidden position": (lambda p: given(p, positions(p, std_m=np.inf)), ALL),
     "mixed sigmas": (lambda p: given(p, positions(p, std_m=1e-3), attitudes(p, range(8))), ()),
     "free lever arm": (lambda p: given(p, positions(p), lever_arm=True), ()),
@@ -102,29 +110,43 @@ def test_free_directions_are_named(case: str):
 
 
 def nullity(problem: Problem) -> int:
-    """Count the singular directions of the dense Jacobian of everything, from jax's own derivative of the residuals."""
-    seen, names = problem.observations, Pinhole.parameter_names()
-    cameras = jnp.stack([jnp.asarray(getattr(problem.cameras, n)) for n in names], axis=1)
-    start = Unknowns(problem.poses, cameras, jnp.asarray(problem.lever_arm), jnp.asarray(problem.points))
-    priors = jax.tree.map(jnp.asarray, problem.priors)
-    sizes = (problem.num_images * 6, problem.num_points * 3, 3)
-
-    def residuals(flat: jax.Array) -> jax.Array:
-        poses, points, lever_arm = jnp.split(flat, np.cumsum(sizes)[:2])
-        step = Step(poses.reshape(-1, 6), jnp.zeros_like(cameras), lever_arm, points.reshape(-1, 3))
-        moved = start.retract(step)
-        pose = jax.tree.map(lambda a: a[seen.image_index], moved.poses)
-        xy_px = problem.cameras.project(pose.transform(moved.points[seen.point_index]))
-        return jnp.concatenate([xy_px.ravel(), *(prior.residual(moved).ravel() for prior in priors)])
-
+    """Count the singular directions of the dense Jacobian of everything free."""
     free = np.concatenate(
         [np.repeat(problem.free.poses, 6), np.repeat(problem.free.points, 3), np.repeat(problem.free.lever_arm, 3)]
     )
-    jacobian = np.asarray(jax.jacfwd(residuals)(jnp.zeros(sum(sizes))))[:, free]
+    priors = jax.tree.map(jnp.asarray, problem.priors)
+    of_priors = [jacobian_of(lambda moved, p=prior: p.residual(moved), problem) for prior in priors]
+    jacobian = np.concatenate([pixel_jacobian(), *of_priors])[:, free]
     jacobian /= np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
     values = np.linalg.svd(jacobian, compute_uv=False)
     # the weakest real directions of these blocks lie near 1e-5, rounding below 1e-12
     return int(np.sum(values < 1e-9)) + max(0, jacobian.shape[1] - len(values))
+
+
+def jacobian_of(residual: Callable[[Unknowns], jax.Array], problem: Problem) -> np.ndarray:
+    """jax's own derivative by all steps: poses, points, lever arm."""
+    values = jax.tree.map(jnp.asarray, (problem.poses, problem.lever_arm, problem.points))
+    start = Unknowns(values[0], jnp.zeros((1, 4)), values[1], values[2])
+    sizes = (problem.num_images * 6, problem.num_points * 3, 3)
+
+    def along(flat: jax.Array) -> jax.Array:
+        poses, points, lever_arm = jnp.split(flat, np.cumsum(sizes)[:2])
+        step = Step(poses.reshape(-1, 6), jnp.zeros((1, 4)), lever_arm, points.reshape(-1, 3))
+        return residual(start.retract(step)).ravel()
+
+    return np.asarray(jax.jacfwd(along)(jnp.zeros(sum(sizes))))
+
+
+@functools.cache
+def pixel_jacobian() -> np.ndarray:
+    problem = block()
+    seen = problem.observations
+
+    def pixels(moved: Unknowns) -> jax.Array:
+        pose = jax.tree.map(lambda a: a[seen.image_index], moved.poses)
+        return problem.cameras.project(pose.transform(moved.points[seen.point_index]))
+
+    return jacobian_of(pixels, problem)
 
 
 def test_lever_arm_along_the_axis_moves_a_level_block():

@@ -1,5 +1,6 @@
 """Every residual group: values by their formulas, derivatives those of `jax.jacfwd`, padding that does no harm."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ from jax import Array
 from scipy.spatial.transform import Rotation
 from small_problems import EVERY_CAMERA, small_problem
 
-from jaxba.ba import AttitudePrior, Step, Unknowns
+from jaxba.ba import AttitudePrior, Rows, Step, Unknowns
 from jaxba.ba._problem import AbstractPrior
 from jaxba.ba.groups import PRIORS, Reprojection
 
@@ -26,9 +27,12 @@ def assert_rows_equal_jacfwd(prior: AbstractPrior, unknowns: Unknowns, tolerance
     def residual(step: Step) -> Array:
         return prior.residual(unknowns.retract(step))
 
-    expected = jax.jit(jax.jacfwd(residual))(no_step(unknowns))
-    rows = jax.jit(prior.rows)(unknowns)
-    np.testing.assert_allclose(rows.residual, prior.residual(unknowns), rtol=0, atol=1e-12)
+    @jax.jit
+    def every(step: Step) -> tuple[Array, Step, Rows]:
+        return residual(step), jax.jacfwd(residual)(step), prior.rows(unknowns)
+
+    value, expected, rows = every(no_step(unknowns))
+    np.testing.assert_allclose(rows.residual, value, rtol=0, atol=1e-12)
     numbers = np.arange(rows.residual.shape[1])
     for block, index, whole in (
         (rows.pose, rows.pose_index, expected.poses),
@@ -144,14 +148,13 @@ def test_derivatives_of_every_camera_equal_jacfwd_with_padding_and_beside_the_ax
 def test_rows_of_infinite_sigma_weigh_nothing_and_keep_derivatives_finite(name):
     prior = PROBLEM.prior(name)
     sigma = next(field for field in ("std_m", "std_rad", "std") if hasattr(prior, field))
-    padded = jax.tree.map(lambda a: a, prior)
-    object.__setattr__(padded, sigma, np.full_like(getattr(prior, sigma), np.inf))
-    assert np.all(padded.residual(UNKNOWNS) == 0)
-    rows = padded.rows(UNKNOWNS)
-    assert all(
-        np.all(block == 0)
-        for block in (rows.residual, rows.pose, rows.intrinsics, rows.lever_arm, rows.point)
-        if block is not None
-    )
-    gradient = jax.grad(lambda step: jnp.sum(padded.residual(UNKNOWNS.retract(step)) ** 2))(no_step(UNKNOWNS))
-    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
+    padded = eqx.tree_at(lambda p: getattr(p, sigma), prior, np.full_like(getattr(prior, sigma), np.inf))
+
+    @jax.jit
+    def every(unknowns: Unknowns) -> tuple[Array, Step, tuple[Array | None, ...]]:
+        gradient = jax.grad(lambda step: jnp.sum(padded.residual(unknowns.retract(step)) ** 2))(no_step(unknowns))
+        rows = padded.rows(unknowns)
+        blocks = rows.residual, rows.pose, rows.intrinsics, rows.lever_arm, rows.point
+        return padded.residual(unknowns), gradient, blocks
+
+    assert all(np.all(np.asarray(leaf) == 0) for leaf in jax.tree.leaves(every(UNKNOWNS)))

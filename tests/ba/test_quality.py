@@ -34,7 +34,7 @@ def test_fisheye_errors_are_in_float64():
     theta = np.arctan(np.hypot(points[:, 0], points[:, 1]) / points[:, 2])
     scale = theta * (1 + 0.02 * theta**2 - 0.003 * theta**4 + 0.001 * theta**6) / np.hypot(points[:, 0], points[:, 1])
     xy_px = points[:, :2] * scale[:, None] * [1000.0, 990.0] + [800.0, 600.0]
-    seen = Observations(xy_px + [3.0, 4.0], np.ones(200), np.zeros(200, int), np.arange(200))
+    seen = Observations(xy_px + np.array([3.0, 4.0]), np.ones(200), np.zeros(200, int), np.arange(200))
     problem = Problem.build(Pose(np.array([[1.0, 0, 0, 0]]), np.zeros((1, 3))), camera, points, seen)
     np.testing.assert_allclose(reprojection_errors(problem), 5.0, atol=1e-9)
 

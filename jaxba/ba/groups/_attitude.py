@@ -2,8 +2,8 @@
 
     r = log(R Q^T) / sigma
 
-with Q the measured rotation `cam_from_world`: the rotation vector, in the camera's frame, from measured to adjusted. A step
-w on the left changes it by `J_l^-1(r) w`.
+with Q the measured rotation `cam_from_world`: the rotation vector, in the camera's frame, from measured to adjusted. A
+step w on the left changes it by `J_l^-1(r) w`.
 """
 
 from typing import ClassVar

@@ -4,12 +4,12 @@ With p = R x + t the point in the camera, A = d pixel / d p (2x3) and the pose's
 
     d/dw = -A [p]_x        d/dv = A        d/dx = A R        d/dK = d pixel / d intrinsics
 
-Only A and d/dK come from jax, one forward derivative for each of x, y, z and each refined intrinsic, elementwise; so the
-chain is exact for every camera model.
+Only A and d/dK come from jax, one forward derivative for each of x, y, z and each refined intrinsic, elementwise; so
+the chain is exact for every camera model.
 
-**Layout.** Observations lie in runs of `ROW_RUN` lanes that share an image. R x + t and A R are batched matrix products, one a
-run: XLA stores the result of a product, where it would compute an elementwise expression anew for each of the twenty
-columns that need it. 147k rows take 6 ms, and 21 ms without the products.
+**Layout.** Observations lie in runs of `ROW_RUN` lanes that share an image. R x + t and A R are batched matrix
+products, one a run: XLA stores the result of a product, where it would compute an elementwise expression anew for each
+of the twenty columns that need it. 147k rows take 6 ms, and 21 ms without the products.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,8 +53,8 @@ class Reprojection(eqx.Module):
     def rows(self, unknowns: Unknowns, reweighting: Reweighting | None = None) -> Float[Array, "runs 2 columns lanes"]:
         """Return residuals and exact derivatives, both made robust by `reweighting` where it is given.
 
-        Columns: pose (6), refined intrinsics, residual (1), point (3). A robust loss multiplies each row of J from the left,
-        so it is applied to A and d/dK before the chain rule.
+        Columns: pose (6), refined intrinsics, residual (1), point (3). A robust loss multiplies each row of J from the
+        left, so it is applied to A and d/dK before the chain rule.
         """
         rotation, (x, y, z) = self._point_in_cam(unknowns)
         arguments = (x, y, z, *(jnp.broadcast_to(k, x.shape) for k in self._intrinsics(unknowns)))

@@ -1,0 +1,103 @@
+"""Parse the command line, call the command, turn errors into one line and an exit code.
+
+Exit codes: 0 done and converged; 1 not converged (what was reached is written all the same); 2 bad input or options;
+130 interrupted by Ctrl-C (likewise written, once the first step was begun).
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, CycloptsError, Parameter
+
+from jaxba import __version__
+from jaxba._errors import JaxbaError
+from jaxba.cli._options import SolveOptions
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+_EXIT_CODES = "Exit codes: 0 converged, 1 not converged (written all the same), 2 bad input or options, 130 Ctrl-C."
+
+app = App(
+    name="jaxba",
+    help="Bundle adjustment on JAX.",
+    version=__version__,
+    help_format="plaintext",
+    result_action="return_value",
+)
+
+_File = Annotated[Path, Parameter(help="A tile.npz, or a BAL problem, text or bz2.")]
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command in `argv` (the process's own arguments if None) and exit with its code."""
+    try:
+        code = app(sys.argv[1:] if argv is None else argv, exit_on_error=False, print_error=False)
+        sys.stdout.flush()
+    except CycloptsError as error:
+        code = _fail(" ".join(str(error).split()) + " See jaxba --help.", BAD_INPUT)
+    except JaxbaError as error:
+        code = _fail(str(error), BAD_INPUT)
+    except KeyboardInterrupt:
+        code = _fail("interrupted; nothing was written.", INTERRUPTED)
+    except BrokenPipeError:  # `jaxba info FILE | head`: whoever read the output has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 1
+    sys.exit(code or 0)
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"jaxba: {message}", file=sys.stderr)
+    return code
+
+
+@app.command(help=f"Adjust a problem, print a summary, write the adjusted tile.\n\n{_EXIT_CODES}")
+def solve(
+    file: _File,
+    /,
+    *,
+    options: Annotated[SolveOptions | None, Parameter(name="*")] = None,
+) -> int:
+    from jaxba.cli._solve import run
+
+    return run(file, options or SolveOptions())
+
+
+@app.command(help="Tell sizes, track lengths, connectivity, gauge, priors, and what is free.")
+def info(
+    file: _File, /, *, json: Annotated[bool, Parameter(negative="", help="Print one JSON object.")] = False
+) -> int:
+    from jaxba.cli._info import run
+
+    return run(file, as_json=json)
+
+
+@app.command(help="Write a synthetic UAV survey as a tile, with the truth as extra_truth_... arrays.")
+def synthetic(
+    out: Annotated[Path, Parameter(help="The tile to write.")],
+    /,
+    *,
+    images: Annotated[int, Parameter(help="How many images.")] = 100,
+    seed: Annotated[int, Parameter(help="The same seed gives the same survey.")] = 0,
+    outliers: Annotated[float, Parameter(help="Share of gross errors among the measured pixels.")] = 0.0,
+    cameras: Annotated[int, Parameter(help="Cameras, each for a stretch of images.")] = 1,
+    points_per_image: Annotated[float, Parameter(help="Tie points over images.")] = 66.0,
+    pixel_std: Annotated[float, Parameter(help="Noise of the measured pixels, px an axis.")] = 0.5,
+    control: Annotated[int, Parameter(help="Control points.")] = 0,
+    gnss: Annotated[bool, Parameter(negative="--no-gnss", help="Measured positions; without, the gauge is free.")] = True,
+) -> int:
+    from jaxba.cli._synthetic import run
+
+    return run(
+        out,
+        num_images=images,
+        seed=seed,
+        outlier_fraction=outliers,
+        num_cameras=cameras,
+        points_per_image=points_per_image,
+        pixel_std_px=pixel_std,
+        num_control=control,
+        gnss=gnss,
+    )

@@ -1,0 +1,181 @@
+"""What `jaxba solve` tells: the facts of a run (its `--json`), and a summary of them in words."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.ba import Problem, Rejected, Report
+from jaxba.cli._options import SolveOptions
+from jaxba.cli._text import first_of, gauge_text, many, table
+from jaxba.geometry import AbstractLoss, Linear
+
+_HEAVY_TAIL = 3.0  # rms over median of the errors; 1.2 without outliers, 8 with 2% of them under least squares
+_LARGE_MEDIAN_PX = 3.0
+_MOST_BOUNDS = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A finished `solve`.
+
+    - `given`: the problem as read; `problem`: with the options' fixed blocks and bounds.
+    - `seconds`: all rounds together, with setup and compile.
+    """
+
+    file: Path
+    out: Path
+    given: Problem
+    problem: Problem
+    found: Rejected
+    loss: AbstractLoss
+    options: SolveOptions
+    seconds: float
+
+    @property
+    def report(self) -> Report:
+        """How the last round went."""
+        report = self.found.solution.report
+        assert report is not None  # only a solve inside jit has none
+        return report
+
+
+def facts(run: Run) -> dict[str, object]:
+    """Return everything about a run by name, for `--json`.
+
+    Costs, steps, times and `history` are of the last round, if there was rejection; `seconds_total` is of all rounds.
+    """
+    solution, report, found = run.found.solution, run.report, run.found.quality
+    before, after = intrinsics(run.problem), intrinsics(solution.apply(run.problem))
+    names = type(run.problem.cameras).parameter_names()
+    return {
+        "result": solution.result,
+        "converged": solution.converged,
+        "advice": solution.advice,
+        "hints": hints(run),
+        "initial_cost": float(solution.initial_cost),
+        "final_cost": float(solution.final_cost),
+        "plain_cost": float(solution.plain_cost),
+        "loss": run.options.loss,
+        "f_scale": run.options.f_scale,
+        "method": run.options.method,
+        "linear_solver": report.linear_solver,
+        "num_steps": int(solution.num_steps),
+        "seconds_setup": report.seconds_setup,
+        "seconds_compile": report.seconds_compile,
+        "seconds_solve": report.seconds_solve,
+        "seconds_total": run.seconds,
+        "median_error_px": found.median_px,
+        "rms_error_px": found.rms_px,
+        "mad_px": found.mad_px,
+        "threshold_px": found.threshold_px,
+        "inlier_rate": found.inlier_rate,
+        "num_images": run.problem.num_images,
+        "num_cameras": run.problem.num_cameras,
+        "num_points": run.problem.num_points,
+        "num_observations": run.problem.num_observations,
+        "num_used": int(np.count_nonzero(run.found.used)),
+        "num_rejected": list(run.found.num_rejected),
+        "dropped": report.dropped.summary(),
+        "free_gauge": list(report.free_gauge),
+        "intrinsics": {
+            name: {"before": before[:, i], "after": after[:, i], "free": np.asarray(run.problem.free.intrinsics)[:, i]}
+            for i, name in enumerate(names)
+        },
+        "at_bounds": at_bounds(run),
+        "input": str(run.file),
+        "output": str(run.out),
+        "history": [
+            {"step": step.step, "seconds": step.seconds, "cost": step.cost, "accepted": step.accepted}
+            for step in report.history
+        ],
+    }
+
+
+def summary(run: Run) -> str:
+    """Return the run in words."""
+    solution, report, found = run.found.solution, run.report, run.found.quality
+    problem = run.problem
+    plain = "" if isinstance(run.loss, Linear) else f" ({run.options.loss}; {solution.plain_cost:.6g} without the loss)"
+    sizes = (
+        many(problem.num_images, "image"),
+        many(problem.num_cameras, "camera"),
+        many(problem.num_points, "point"),
+        many(problem.num_observations, "observation"),
+    )
+    seconds = f"{report.seconds_setup:.2f} s setup, {report.seconds_compile:.2f} s compile"
+    rejected = [f"round {i + 1}: {many(n, 'observation')}" for i, n in enumerate(run.found.num_rejected)]
+    bounds = at_bounds(run)
+    return table(
+        (
+            ("problem", f"{run.file}: {', '.join(sizes)}"),
+            ("result", [solution.advice, *hints(run)]),
+            ("cost", f"{solution.initial_cost:.6g} -> {solution.final_cost:.6g}{plain}"),
+            ("steps", f"{solution.num_steps} in {report.seconds_solve:.2f} s ({seconds}; {report.linear_solver})"),
+            ("left out", report.dropped.summary()),
+            ("rejected", rejected),
+            ("gauge", gauge_text(report.free_gauge)),
+            ("errors", f"median {found.median_px:.3f} px, MAD {found.mad_px:.3f} px, rms {found.rms_px:.3f} px"),
+            ("inliers", f"{found.inlier_rate:.1%} within {found.threshold_px:.3f} px (median + "
+                        f"{run.options.mad_factor:g} MAD)"),
+            ("intrinsics", _refined(run)),
+            ("at bounds", first_of(bounds, _MOST_BOUNDS) if bounds else []),
+            ("written", str(run.out)),
+        )
+    )  # fmt: skip
+
+
+def hints(run: Run) -> list[str]:
+    """Return what to do about what the numbers show; empty if they look well."""
+    found, texts = run.found.quality, []
+    if isinstance(run.loss, Linear) and not run.options.reject and found.rms_px > _HEAVY_TAIL * found.median_px:
+        texts.append(
+            f"A few large errors rule the result (rms {found.rms_px:.2f} px, median {found.median_px:.2f} px): use "
+            "--loss huber, or --reject mad."
+        )
+    if found.median_px > _LARGE_MEDIAN_PX:
+        texts.append(
+            f"The median error of {found.median_px:.2f} px is large: check the focal length against the sensor's, and for "
+            "images of another camera."
+        )
+    if at_bounds(run):
+        texts.append(
+            "Intrinsics lie at their bounds, where self-calibration absorbs model error: fix them, add oblique images or "
+            "control points, or use another loss."
+        )
+    return texts
+
+
+def at_bounds(run: Run) -> list[str]:
+    """Name the free intrinsics that lie at a bound."""
+    problem = run.problem
+    values, names = intrinsics(run.found.solution.apply(problem)), type(problem.cameras).parameter_names()
+    texts = []
+    for word, bound in (("lower", np.asarray(problem.lower)), ("upper", np.asarray(problem.upper))):
+        close = np.isclose(values, bound, rtol=1e-9, atol=0.0) & np.asarray(problem.free.intrinsics)
+        for camera, column in np.argwhere(close):
+            of_camera = f" of camera {camera}" if problem.num_cameras > 1 else ""
+            texts.append(f"{names[column]}{of_camera} at its {word} bound {bound[camera, column]:.6g}")
+    return texts
+
+
+def intrinsics(problem: Problem) -> Float[np.ndarray, "cameras parameters"]:
+    """Return the intrinsics, a column for each of the model's parameters."""
+    cameras = problem.cameras
+    return np.stack([np.asarray(getattr(cameras, name), float) for name in type(cameras).parameter_names()], axis=1)
+
+
+def _refined(run: Run) -> str:
+    """Return the free intrinsics before and after; of several cameras their medians."""
+    names = type(run.problem.cameras).parameter_names()
+    free = np.asarray(run.problem.free.intrinsics)
+    before, after = intrinsics(run.problem), intrinsics(run.found.solution.apply(run.problem))
+    texts = []
+    for i, name in enumerate(names):
+        chosen = free[:, i]
+        if chosen.any():
+            texts.append(f"{name} {np.median(before[chosen, i]):.6g} -> {np.median(after[chosen, i]):.6g}")
+    if not texts:
+        return "all fixed"
+    return ("" if run.problem.num_cameras == 1 else "medians: ") + ", ".join(texts)

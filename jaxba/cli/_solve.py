@@ -1,0 +1,198 @@
+"""`jaxba solve`: read, adjust, write, tell."""
+
+import contextlib
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxba._errors import JaxbaError
+from jaxba.ba import HistoryStep, Problem, Rejected, quality, solve, solve_and_reject
+from jaxba.cli import _progress
+from jaxba.cli._cache import use_compilation_cache
+from jaxba.cli._options import SolveOptions
+from jaxba.cli._result import Run, facts, summary
+from jaxba.cli._text import to_json
+from jaxba.geometry import LOSSES, AbstractLoss
+from jaxba.io import read_problem, refuse_same_file, write_bal, write_tile
+from jaxba.io._bal import _what_bal_cannot_hold
+
+NOT_CONVERGED, INTERRUPTED = 1, 130
+_ROUNDS = 2
+_FILE_ENDINGS = (".bz2", ".txt", ".npz")
+_BAL_ENDINGS = (".txt", ".txt.bz2")
+_KINDS = ("intrinsics", "poses", "points")
+
+
+def run(file: Path, options: SolveOptions) -> int:
+    """Adjust the problem in a file, write the result, print it; return the exit code."""
+    loss, bounds = make_loss(options), parse_bounds(options.bounds)
+    _check_numbers(options)
+    out = options.out or default_output(file)
+    refuse_same_file(file, out)
+    given = read_problem(file)
+    problem = fix(given, options.fix).bound(**bounds)
+    _check_output(out, given)
+    use_compilation_cache()
+    begin = time.perf_counter()
+    found = _adjust(problem, loss, options)
+    seconds = time.perf_counter() - begin
+    _write(out, given, problem, found)
+    done = Run(file, out, given, problem, found, loss, options, seconds)
+    if options.json:
+        print(to_json(facts(done)))
+    elif not options.quiet:
+        print(summary(done))
+    if found.solution.result == "interrupted":
+        print(f"jaxba: interrupted; {out} holds the values reached so far.", file=sys.stderr)
+        return INTERRUPTED
+    return 0 if found.solution.converged else NOT_CONVERGED
+
+
+def make_loss(options: SolveOptions) -> AbstractLoss:
+    """Return the loss that was asked for.
+
+    Raises:
+        JaxbaError: a scale that is not positive, or a shape for a loss that has none.
+    """
+    if not 0 < options.f_scale < math.inf:
+        raise JaxbaError(f"--f-scale {options.f_scale:g}: give a positive number, such as 1.")
+    scale = {"f_scale": options.f_scale}
+    if options.alpha is None:
+        return LOSSES[options.loss](**scale)
+    if options.loss != "barron":
+        raise JaxbaError(f"--alpha {options.alpha:g}: only --loss barron has a shape; this is --loss {options.loss}.")
+    if math.isnan(options.alpha) or options.alpha > 2:
+        raise JaxbaError(f"--alpha {options.alpha:g}: give 2 (least squares) or less.")
+    return LOSSES["barron"](alpha=options.alpha, **scale)
+
+
+def parse_bounds(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return the bounds in texts such as `focal=0.9,1.1`.
+
+    Raises:
+        JaxbaError: another form, or one name twice.
+
+    >>> parse_bounds(["focal=0.9,1.1", "k1=-0.1,0.1"])
+    {'focal': (0.9, 1.1), 'k1': (-0.1, 0.1)}
+    """
+    bounds: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, _, values = text.partition("=")
+        try:
+            low, high = (float(value) for value in values.split(","))
+        except ValueError as error:
+            raise JaxbaError(f"--bounds {text}: give a name, = and two numbers, as in focal=0.9,1.1.") from error
+        if name in bounds:
+            raise JaxbaError(f"--bounds {text}: {name} has bounds already; give one pair.")
+        bounds[name] = (low, high)
+    return bounds
+
+
+def fix(problem: Problem, texts: Sequence[str]) -> Problem:
+    """Return the problem with what the texts name held fixed: kinds, or intrinsics by name, separated by commas."""
+    names = [name for text in texts for name in text.split(",")]
+    parameters = type(problem.cameras).parameter_names()
+    for name in names:
+        if name not in (*_KINDS, *parameters):
+            model = type(problem.cameras).__name__
+            raise JaxbaError(
+                f"--fix {name}: choose from {', '.join(_KINDS)} and the {model} camera's {', '.join(parameters)}."
+            )
+    return problem.fix(
+        poses="poses" in names,
+        points="points" in names,
+        intrinsics="intrinsics" in names or [name for name in names if name in parameters],
+    )
+
+
+def default_output(file: Path) -> Path:
+    """Return where the result of a file goes if nothing is said.
+
+    >>> default_output(Path("a/tile.npz")).as_posix(), default_output(Path("problem-49-pre.txt.bz2")).as_posix()
+    ('a/tile.solved.npz', 'problem-49-pre.solved.npz')
+    """
+    name = file.name
+    for ending in _FILE_ENDINGS:
+        name = name.removesuffix(ending)
+    return file.with_name(f"{name or file.name}.solved.npz")
+
+
+def _check_numbers(options: SolveOptions) -> None:
+    """Refuse what could only end in nonsense, before anything is computed."""
+    if options.max_nfev < 1:
+        raise JaxbaError(f"--max-nfev {options.max_nfev}: give 1 or more.")
+    for name in ("ftol", "xtol", "gtol"):
+        value = getattr(options, name)
+        if not 0 <= value < math.inf:
+            raise JaxbaError(f"--{name} {value:g}: give 0 (never stop for it) or a small positive number.")
+    if not 0 < options.mad_factor < math.inf:
+        raise JaxbaError(f"--mad-factor {options.mad_factor:g}: give a positive number, such as 2.5.")
+    if options.rounds is not None and options.reject is None:
+        raise JaxbaError(f"--rounds {options.rounds}: rounds of what? Add --reject mad.")
+    if options.rounds is not None and options.rounds < 0:
+        raise JaxbaError(f"--rounds {options.rounds}: give 0 or more.")
+
+
+def _check_output(out: Path, given: Problem) -> None:
+    """Refuse, before a solve that may take minutes, an output that cannot be written after it."""
+    folder = Path(os.path.realpath(out)).parent
+    if out.is_dir():
+        raise JaxbaError(f"{out}: cannot be written, it is a folder: add a file name.")
+    if not folder.is_dir():
+        raise JaxbaError(f"{out}: cannot be written, there is no folder {folder}: create it, or choose another place.")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise JaxbaError(
+            f"{out}: cannot be written, the folder may not be written to: choose another place (--out), or change its "
+            "permissions."
+        )
+    if out.name.endswith(_BAL_ENDINGS):
+        lost = _what_bal_cannot_hold(given)
+        if lost:
+            raise JaxbaError(f"{out}: BAL cannot hold {'; '.join(lost)}. Name a tile (--out NAME.npz) instead.")
+
+
+def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Rejected:
+    """Solve, with rounds of rejection if asked for; a plain solve comes back as a result of no rounds."""
+    with contextlib.ExitStack() as stack:
+        callback: Callable[[HistoryStep], None] | None = None
+        if options.verbose:
+            stream = sys.stderr if options.json else sys.stdout
+            callback = lambda step: _progress.print_step(step, stream)  # noqa: E731
+        elif sys.stderr.isatty() and not options.quiet:
+            callback = stack.enter_context(_progress.line(sys.stderr))
+        settings = {
+            "loss": loss,
+            "method": options.method,
+            "linear_solver": options.linear_solver,
+            "max_nfev": options.max_nfev,
+            "ftol": options.ftol,
+            "xtol": options.xtol,
+            "gtol": options.gtol,
+            "callback": callback,
+        }
+        if options.reject:
+            rounds = _ROUNDS if options.rounds is None else options.rounds
+            return solve_and_reject(problem, rounds=rounds, mad_factor=options.mad_factor, **settings)
+        solution = solve(problem, **settings)
+        report = solution.report
+        assert report is not None
+        used = ~report.dropped.observations
+        return Rejected(solution, used, quality(solution.apply(problem), used, mad_factor=options.mad_factor), ())
+
+
+def _write(out: Path, given: Problem, problem: Problem, found: Rejected) -> None:
+    """Write the solution: a tile with the options' fixed blocks and bounds in it, or BAL text, which has no room for them."""
+    if out.name.endswith(_BAL_ENDINGS):
+        write_bal(out, found.solution.apply(given))
+        return
+    extras = {
+        "error_px": found.quality.error_px,
+        "is_inlier": np.asarray(found.quality.is_inlier),
+        "is_used": np.asarray(found.used),
+    }
+    write_tile(out, found.solution.apply(problem), extras=extras)

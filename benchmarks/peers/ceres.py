@@ -257,16 +257,12 @@ def _pose_manifold() -> pyceres.Manifold:
     pyceres has no product of manifolds, and none can be written in Python. The Python object that it hands out would
     delete what COLMAP owns, so a reference more is counted than there is and neither is ever deleted.
     """
-    options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=2, num_points3D=10
-    )
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=2, num_points3D=10)
     reconstruction = pycolmap.synthesize_dataset(options)
     config = pycolmap.BundleAdjustmentConfig()
     for image in reconstruction.reg_image_ids():
         config.add_image(image)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(
-        pycolmap.BundleAdjustmentOptions(), config, reconstruction
-    )
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(pycolmap.BundleAdjustmentOptions(), config, reconstruction)
     pose = reconstruction.frame(reconstruction.reg_frame_ids()[0]).rig_from_world
     assert pose is not None  # registered
     manifold = adjuster.problem.get_manifold(pose.params)

@@ -209,9 +209,7 @@ def _evaluator(
     return evaluate
 
 
-def _with_loss(
-    loss: AbstractLoss, residual: np.ndarray, jacobian: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _with_loss(loss: AbstractLoss, residual: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals whose squares sum to rho, (components, rows), and their derivatives, (components, rows, n)."""
     s = np.sum(residual**2, axis=0)
     safe = np.maximum(s, 1e-12)  # below, rho(s) = s to rounding and g = 1

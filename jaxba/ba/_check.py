@@ -155,9 +155,7 @@ def prepare(problem: Problem) -> Prepared:
         summary = "; ".join(dropped.summary())
         raise JaxbaError(f"Nothing that is free is measured: {summary}. Free more, or measure more.")
     held = {"image_index": idle_images, "point_index": loose, "camera_index": idle_cameras}
-    observations = Observations(
-        np.asarray(seen.xy_px)[kept], np.asarray(seen.std_px)[kept], image[kept], point[kept]
-    )
+    observations = Observations(np.asarray(seen.xy_px)[kept], np.asarray(seen.std_px)[kept], image[kept], point[kept])
     changed = dataclasses.replace(
         problem,
         observations=observations,

@@ -5,7 +5,7 @@ are apart. jax's persistent cache, where it is switched on, keeps the result acr
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,9 +36,7 @@ def compiled(solver: AbstractSchurSolver, unknowns: Unknowns, system: System, pl
 
 
 @functools.lru_cache(maxsize=_KEPT)
-def _compile(
-    solver: AbstractSchurSolver, structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[tuple[int, ...], str], ...]
-) -> Compiled:
+def _compile(solver: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]) -> Compiled:
     arguments = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
     unknowns, system, plain = jax.tree.unflatten(structure, arguments)
 

@@ -159,9 +159,7 @@ def _factor_banded(panels: Float[Array, "panels panel band"]) -> tuple[Array, Ar
 
     def factor(window: Array, rows: Array) -> tuple[Array, tuple[Array, Array]]:
         root = lax.linalg.cholesky(window[:size, :size], symmetrize_input=False)
-        panel = lax.linalg.triangular_solve(
-            root, window[size:, :size], left_side=False, lower=True, transpose_a=True
-        )
+        panel = lax.linalg.triangular_solve(root, window[size:, :size], left_side=False, lower=True, transpose_a=True)
         moved = jnp.pad(window[size:, size:] - panel @ panel.T, ((0, size), (0, size)))
         return lax.dynamic_update_slice(moved, rows, (below, 0)), (root, panel)
 
@@ -202,7 +200,10 @@ def multiply_images(
 
 
 def _solve_cg(
-    system: System, reduced: Reduced, roots: Float[Array, "images block block"], rhs: Float[Array, "images block columns"]
+    system: System,
+    reduced: Reduced,
+    roots: Float[Array, "images block block"],
+    rhs: Float[Array, "images block columns"],
 ) -> tuple[Float[Array, "images block columns"], Int[Array, ""]]:
     """Conjugate gradients on every column at once, preconditioned by A's block diagonal."""
 

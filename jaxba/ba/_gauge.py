@@ -108,10 +108,10 @@ def _normal_matrices(
         part = part[inside]
         along = np.zeros((len(part), rows.residual.shape[0], 10))
         if rows.pose is not None:
-            jacobian = np.moveaxis(np.asarray(rows.pose), 2, 0)[inside]
+            jacobian = np.moveaxis(np.asarray(rows.pose.jacobian), 2, 0)[inside]
             along[:, :, :7] += jacobian @ parts.move_poses(part, _poses(problem, np.asarray(image)[inside]))
         if rows.point is not None:
-            jacobian = np.moveaxis(np.asarray(rows.point), 2, 0)[inside]
+            jacobian = np.moveaxis(np.asarray(rows.point.jacobian), 2, 0)[inside]
             along[:, :, :7] += jacobian @ parts.move_points(part, np.asarray(problem.points)[np.asarray(point)[inside]])
         if rows.lever_arm is not None:
             along[:, :, 7:] = np.moveaxis(np.asarray(rows.lever_arm), 2, 0)[inside] * parts.size[part][:, None, None]

@@ -17,15 +17,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._plan import ROW_RUN
+from jaxba.ba._priors import block_products, block_transpose, product, robust_rows, transpose_product
 from jaxba.ba._robust import reweighting
-from jaxba.ba._rows import Rows, Step, Unknowns, rows_of
+from jaxba.ba._rows import Rows, Step, Unknowns, rows_of, segments, sum_components
 from jaxba.ba._system import System
 from jaxba.ba.groups import Reprojection
-from jaxba.geometry import AbstractLoss
 
 
 class Linearisation(eqx.Module):
@@ -71,9 +72,9 @@ def point_costs(system: System, unknowns: Unknowns) -> Float[Array, " points"]:
     total = segments(of_rows, system.reprojection.point_index, system.shape.num_points)
     for prior in system.priors:
         rows = prior.rows(unknowns)
-        if rows.point_index is not None:
+        if rows.point is not None:
             of_prior = prior.loss(sum_components(rows.residual**2))
-            total += segments(of_prior, rows.point_index, system.shape.num_points)
+            total += segments(of_prior, rows.point.index, system.shape.num_points)
     return total
 
 
@@ -94,11 +95,10 @@ def point_equations(
     (of_points,), _ = _scan_chunks(system, body, start)
     gradient, hessian = of_points[:, :, 0], of_points[:, :, 1:]
     for prior in system.priors:
-        rows = _robust(prior.rows(unknowns), prior.loss, bend)
+        rows = robust_rows(system, prior, unknowns, bend)
         if rows.point is not None:
-            gradient += segments(_dot(rows.point, rows.residual).T, rows.point_index, system.shape.num_points)
-            products = jnp.einsum("cin,cjn->nij", rows.point, rows.point)
-            hessian += segments(products, rows.point_index, system.shape.num_points)
+            gradient += block_transpose(rows.point, rows.residual, system.shape.num_points)
+            hessian += block_products(rows.point, system.shape.num_points)
     return gradient, hessian
 
 
@@ -122,7 +122,9 @@ def linearise(system: System, unknowns: Unknowns, bend: Float[Array, ""] | float
         image_products = jnp.einsum("rka,rkb->rab", flat, flat)
 
         pixel = jnp.moveaxis(by_lane, 1, 2).reshape(-1, 2, by_lane.shape[-1])
-        of_point = pixel[:, 0, first_point:, None] * pixel[:, 0, None] + pixel[:, 1, first_point:, None] * pixel[:, 1, None]
+        of_point = (
+            pixel[:, 0, first_point:, None] * pixel[:, 0, None] + pixel[:, 1, first_point:, None] * pixel[:, 1, None]
+        )
         index = part.point_index.reshape(-1)
         of_points = of_points.at[index].add(of_point[:, :, 6 + k :], mode="promise_in_bounds")
         if cameras:
@@ -157,14 +159,13 @@ def linearise(system: System, unknowns: Unknowns, bend: Float[Array, ""] | float
         points=jnp.diagonal(of_points[:, :, 1:], axis1=1, axis2=2),
     )
     point_products = of_points[:, :, 1:]
-    prior_rows = tuple(_robust(_masked(p.rows(unknowns), system), p.loss, bend) for p in system.priors)
+    prior_rows = tuple(robust_rows(system, prior, unknowns, bend) for prior in system.priors)
     for extra in prior_rows:
-        gradient = _add(gradient, transpose_product(extra, extra.residual, zero))
+        gradient = jax.tree.map(jnp.add, gradient, transpose_product(extra, extra.residual, zero))
         squared = jax.tree.map(lambda a: a**2 if jnp.issubdtype(a.dtype, jnp.floating) else a, extra)
-        diagonal = _add(diagonal, transpose_product(squared, jnp.ones_like(extra.residual), zero))
+        diagonal = jax.tree.map(jnp.add, diagonal, transpose_product(squared, jnp.ones_like(extra.residual), zero))
         if extra.point is not None:
-            products = jnp.einsum("cin,cjn->nij", extra.point, extra.point)
-            point_products += segments(products, extra.point_index, shape.num_points)
+            point_products += block_products(extra.point, shape.num_points)
     return Linearisation(image_products, w, point_products, point_shared, prior_rows, gradient, diagonal)
 
 
@@ -181,7 +182,7 @@ def curvature(system: System, model: Linearisation, step: Step) -> Float[Array, 
     total += 2 * jnp.vdot(step.points, of_points)
     # the points' blocks hold the priors on points already
     for rows in model.prior_rows:
-        alone = Rows(rows.residual, rows.pose_index, rows.pose, rows.camera_index, rows.intrinsics, rows.lever_arm)
+        alone = Rows(rows.residual, rows.pose, rows.intrinsics, rows.lever_arm)
         total += jnp.sum(product(alone, step) ** 2)
     return total
 
@@ -210,47 +211,9 @@ def sum_cameras(system: System, images: Float[Array, "images *rest"]) -> Float[A
     return segments(images, system.reprojection.camera_index, system.shape.num_cameras)
 
 
-def segments(values: Float[Array, "n *rest"], index: Int[Array, "..."], count: int) -> Float[Array, "m *rest"]:
-    """Sum values by index."""
-    return jax.ops.segment_sum(values, index.reshape(-1), num_segments=count, mode="promise_in_bounds")
-
-
 def refined_columns(system: System) -> Int[Array, " refined"]:
     """Columns of the intrinsics that are free in any camera."""
     return jnp.array([i for i, refined in enumerate(system.shape.refined) if refined], jnp.int32)
-
-
-def product(rows: Rows, step: Step) -> Float[Array, "components rows"]:
-    """Return `J d` of a prior's rows."""
-    total = jnp.zeros_like(rows.residual)
-    if rows.pose is not None:
-        total += _along(rows.pose, step.poses, rows.pose_index)
-    if rows.intrinsics is not None:
-        total += _along(rows.intrinsics, step.intrinsics, rows.camera_index)
-    if rows.lever_arm is not None:
-        total += jnp.einsum("ckn,k->cn", rows.lever_arm, step.lever_arm)
-    if rows.point is not None:
-        total += _along(rows.point, step.points, rows.point_index)
-    return total
-
-
-def transpose_product(rows: Rows, values: Float[Array, "components rows"], zero: Step) -> Step:
-    """Return `J^T v` of a prior's rows; `zero` gives the shapes."""
-    poses, intrinsics, lever_arm, points = zero.poses, zero.intrinsics, zero.lever_arm, zero.points
-    if rows.pose is not None:
-        poses = segments(_dot(rows.pose, values).T, rows.pose_index, poses.shape[0])
-    if rows.intrinsics is not None:
-        intrinsics = segments(_dot(rows.intrinsics, values).T, rows.camera_index, intrinsics.shape[0])
-    if rows.lever_arm is not None:
-        lever_arm = jnp.sum(_dot(rows.lever_arm, values), axis=-1)
-    if rows.point is not None:
-        points = segments(_dot(rows.point, values).T, rows.point_index, points.shape[0])
-    return Step(poses, intrinsics, lever_arm, points)
-
-
-def sum_components(values: Float[Array, "components *rest"]) -> Float[Array, "*rest"]:
-    """Sum over a short leading axis, term by term: XLA's own reduction over such an axis is ten times slower."""
-    return functools.reduce(jnp.add, [values[i] for i in range(values.shape[0])])
 
 
 def _scan_chunks(
@@ -261,29 +224,19 @@ def _scan_chunks(
     """Fold `body` over chunks of runs; its outputs come back joined along their first axis."""
     group, runs = system.reprojection, system.shape.chunk_runs
 
-    def split(a: Array) -> Array:
+    def split(a: Array | np.ndarray) -> Array:
         return jnp.asarray(a).reshape(-1, runs, *a.shape[1:])
 
     xy_px = jnp.swapaxes(jnp.asarray(group.xy_px).reshape(2, -1, runs, ROW_RUN), 0, 1)
     fields = (xy_px, split(group.weight), split(group.point_index), split(group.run_image))
 
     def step(carry: Any, fields: tuple[Array, ...]) -> tuple[Any, Any]:
-        return body(carry, Reprojection(*fields, group.camera_index, group.model, group.refined))
+        xy_px, weight, point_index, run_image = fields
+        part = Reprojection(xy_px, weight, point_index, run_image, group.camera_index, group.model, group.refined)
+        return body(carry, part)
 
     carry, out = jax.lax.scan(step, carry, fields)
     return carry, jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
-
-
-def _add(a: Step, b: Step) -> Step:
-    return jax.tree.map(jnp.add, a, b)
-
-
-def _dot(jacobian: Float[Array, "c k n"], values: Float[Array, "c n"]) -> Float[Array, "k n"]:
-    return sum_components(jacobian * values[:, None])
-
-
-def _along(jacobian: Float[Array, "c k n"], step: Float[Array, "m k"], index: Int[Array, " n"]) -> Float[Array, "c n"]:
-    return sum_components(jnp.swapaxes(jacobian, 0, 1) * rows_of(step, index).T[:, None])
 
 
 def _masked_columns(
@@ -300,37 +253,3 @@ def _masked_columns(
     if shape.any_fixed_point:
         rows = rows.at[:, :, 7 + k :].multiply(rows_of(free.points[:, 0], group.point_index)[:, None, None])
     return rows
-
-
-def _masked(rows: Rows, system: System) -> Rows:
-    free = system.free
-    pose, intrinsics, lever_arm, point = rows.pose, rows.intrinsics, rows.lever_arm, rows.point
-    if pose is not None:
-        pose = pose * rows_of(free.poses, rows.pose_index).T[None]
-    if intrinsics is not None:
-        intrinsics = intrinsics * rows_of(free.intrinsics, rows.camera_index).T[None]
-    if lever_arm is not None:
-        lever_arm = lever_arm * free.lever_arm[:, None]
-    if point is not None:
-        point = point * rows_of(free.points, rows.point_index).T[None]
-    return Rows(
-        rows.residual, rows.pose_index, pose, rows.camera_index, intrinsics, lever_arm, rows.point_index, point
-    )
-
-
-def _robust(rows: Rows, loss: AbstractLoss, bend: Array) -> Rows:
-    residual, reweighted = reweighting(list(rows.residual), loss, bend)
-
-    def optional(jacobian: Array | None) -> Array | None:
-        return None if jacobian is None else jnp.stack(reweighted(list(jacobian)))
-
-    return Rows(
-        jnp.stack(residual),
-        rows.pose_index,
-        optional(rows.pose),
-        rows.camera_index,
-        optional(rows.intrinsics),
-        optional(rows.lever_arm),
-        rows.point_index,
-        optional(rows.point),
-    )

@@ -161,9 +161,9 @@ def _sum_of_losses(system: System, plan: Plan, unknowns: Unknowns, model: Linear
     for prior, rows in zip(system.priors, model.prior_rows, strict=True):
         residual = prior.residual(unknowns)
         depends = jnp.zeros(residual.shape, bool)
-        for derivative in (rows.pose, rows.intrinsics, rows.lever_arm, rows.point):
-            if derivative is not None:
-                depends |= jnp.any(derivative != 0, axis=1)
+        blocks = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
+        for derivative in [*blocks, *([] if rows.lever_arm is None else [rows.lever_arm])]:
+            depends |= jnp.any(derivative != 0, axis=1)
         total += jnp.sum(prior.loss(jnp.sum(jnp.where(depends, residual, 0.0) ** 2, axis=0)))
         number += jnp.sum(depends)
     return total, number

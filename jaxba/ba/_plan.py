@@ -20,8 +20,8 @@ import dataclasses
 from typing import Literal
 
 import equinox as eqx
-import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Int
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -105,7 +105,7 @@ def make_plan(problem: Problem, *, linear_solver: LinearSolver = "auto") -> Plan
     image = np.asarray(problem.observations.image_index)
     point = np.asarray(problem.observations.point_index)
     free_pose, free_point = np.asarray(problem.free.poses), np.asarray(problem.free.points)
-    refined = np.asarray(problem.free.intrinsics).any(axis=0)
+    refined = np.atleast_1d(np.asarray(problem.free.intrinsics).any(axis=0))
     own_cameras = _own_cameras(problem) and problem.num_cameras > 1 and not _any_bound(problem)
     block = 6 + (int(refined.sum()) if own_cameras else 0)
 
@@ -211,7 +211,7 @@ def _order_images(
 
 def _sweeps(problem: Problem) -> list[Int[np.ndarray, " images"]]:
     """Orders of the images along twelve directions in the plane of the block; none where positions are traced."""
-    if isinstance(problem.poses.translation, jax.core.Tracer) or isinstance(problem.poses.quaternion, jax.core.Tracer):
+    if isinstance(problem.poses.translation, Tracer) or isinstance(problem.poses.quaternion, Tracer):
         return []
     rotation = Rotation.from_quat(np.asarray(problem.poses.quaternion), scalar_first=True)
     center = -rotation.apply(np.asarray(problem.poses.translation), inverse=True)
@@ -265,7 +265,10 @@ def _layout_rows(
 
 
 def _pairs(
-    row_image: Int[np.ndarray, " rows"], row_point: Int[np.ndarray, " rows"], rows: Int[np.ndarray, " n"], num_images: int
+    row_image: Int[np.ndarray, " rows"],
+    row_point: Int[np.ndarray, " rows"],
+    rows: Int[np.ndarray, " n"],
+    num_images: int,
 ) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
     """Return all pairs of rows that see one point from two images, by block: (later row, earlier row, block)."""
     rows = rows[np.argsort(row_point[rows], kind="stable")]  # by point, images ascending within

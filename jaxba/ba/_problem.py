@@ -199,9 +199,7 @@ class Problem(eqx.Module):
             elif key in names:
                 lower[:, names.index(key)], upper[:, names.index(key)] = low, high
             else:
-                raise JaxbaError(
-                    f"bounds {key}: a {type(self.cameras).__name__} camera has focal, {', '.join(names)}."
-                )
+                raise JaxbaError(f"bounds {key}: a {type(self.cameras).__name__} camera has focal, {', '.join(names)}.")
         return eqx.tree_at(lambda p: (p.lower, p.upper), self, (lower, upper))
 
     def prior(self, name: str) -> AbstractPrior | None:

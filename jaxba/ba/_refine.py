@@ -13,6 +13,7 @@ afterwards most of the loss's curvature, which is fast near it.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
@@ -53,5 +54,5 @@ def refine_points(system: System, trial: Unknowns, before: Unknowns, near: Bool[
     return jax.lax.scan(sweep, start, length=_SWEEPS if isinstance(system.loss, Linear) else _ROBUST_SWEEPS)[0][0]
 
 
-def _with_points(unknowns: Unknowns, points: Float[Array, "points 3"]) -> Unknowns:
+def _with_points(unknowns: Unknowns, points: Float[Array | np.ndarray, "points 3"]) -> Unknowns:
     return eqx.tree_at(lambda u: u.points, unknowns, points)

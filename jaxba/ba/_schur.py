@@ -21,9 +21,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.ba._linearise import Linearisation, refined_columns, segments, sum_cameras, sum_runs, w_product
+from jaxba.ba._linearise import Linearisation, refined_columns, sum_cameras, sum_runs, w_product
 from jaxba.ba._plan import ROW_RUN
-from jaxba.ba._rows import Rows, Step, rows_of
+from jaxba.ba._priors import block_products
+from jaxba.ba._rows import Block, Rows, Step, rows_of, segments
 from jaxba.ba._system import System
 
 
@@ -55,7 +56,7 @@ def eliminate_points(system: System, model: Linearisation, damping: Step) -> Red
     """Return the reduced system of `J^T J + diag(damping)`; unknowns that are fixed get a one on the diagonal."""
     shape = system.shape
     damping = jax.tree.map(lambda d, free: d + (1 - free), damping, system.free)
-    root = _inverse_root(model.point_products + _diagonal_matrix(damping.points))
+    root = _inverse_root(model.point_products + _diagonal_matrix(jnp.asarray(damping.points)))
     z_shared = _apply_root(root, model.point_shared)
     z, products = _eliminate_rows(system, model.w, root, z_shared)
     eliminated = sum_runs(system, products)
@@ -86,7 +87,7 @@ def eliminate_points(system: System, model: Linearisation, damping: Step) -> Red
 
 def reduce_vector(system: System, reduced: Reduced, rhs: Step) -> ReducedVector:
     """Return the right-hand side of the reduced system, `b - W V^-1 b_points`."""
-    half = _apply_root(reduced.point_root, rhs.points[:, :, None])[:, :, 0]
+    half = _apply_root(reduced.point_root, jnp.asarray(rhs.points)[:, :, None])[:, :, 0]
     at_rows = rows_of(half, system.reprojection.point_index).reshape(-1, 3 * ROW_RUN)
     z = reduced.z.reshape(-1, 3 * ROW_RUN, reduced.z.shape[-1])
     through = jnp.einsum("rka,rk->ra", z, at_rows)
@@ -101,7 +102,7 @@ def back_substitute(system: System, reduced: Reduced, rhs: Step, solution: Reduc
     moved = w_product(system, reduced.z, solution.images)
     moved = segments(moved, system.reprojection.point_index, system.shape.num_points)
     moved += reduced.z_shared @ solution.border[: reduced.z_shared.shape[-1]]
-    half = _apply_root(reduced.point_root, rhs.points[:, :, None])[:, :, 0]
+    half = _apply_root(reduced.point_root, jnp.asarray(rhs.points)[:, :, None])[:, :, 0]
     points = _apply_root_transposed(reduced.point_root, half - moved)
     return eqx.tree_at(lambda s: s.points, from_reduced(system, solution, rhs), points)
 
@@ -123,11 +124,12 @@ def solve_points(
 def to_reduced(system: System, step: Step) -> ReducedVector:
     """Return the images' and the border's part of a step."""
     shape = system.shape
+    poses, lever_arm = jnp.asarray(step.poses), jnp.asarray(step.lever_arm)
     intrinsics = step.intrinsics[:, refined_columns(system)]
-    border = step.lever_arm if shape.lever_arm else step.lever_arm[:0]
+    border = lever_arm if shape.lever_arm else lever_arm[:0]
     if shape.own_cameras:
-        return ReducedVector(jnp.concatenate([step.poses, intrinsics], axis=1), border)
-    return ReducedVector(step.poses, jnp.concatenate([intrinsics.reshape(-1), border]))
+        return ReducedVector(jnp.concatenate([poses, intrinsics], axis=1), border)
+    return ReducedVector(poses, jnp.concatenate([intrinsics.reshape(-1), border]))
 
 
 def from_reduced(system: System, vector: ReducedVector, like: Step) -> Step:
@@ -135,14 +137,21 @@ def from_reduced(system: System, vector: ReducedVector, like: Step) -> Step:
     shape = system.shape
     zero = jax.tree.map(jnp.zeros_like, like)
     shared = shape.num_shared_cameras * shape.num_refined
-    refined = vector.images[:, 6:] if shape.own_cameras else vector.border[:shared].reshape(shape.num_cameras, shape.num_refined)
+    refined = (
+        vector.images[:, 6:]
+        if shape.own_cameras
+        else vector.border[:shared].reshape(shape.num_cameras, shape.num_refined)
+    )
     lever_arm = vector.border[shared:] if shape.lever_arm else zero.lever_arm
     intrinsics = zero.intrinsics.at[:, refined_columns(system)].set(refined)
     return Step(vector.images[:, :6], intrinsics, lever_arm, zero.points)
 
 
 def _eliminate_rows(
-    system: System, w: Float[Array, "rows 3 block"], root: Float[Array, "points 6"], z_shared: Float[Array, "points 3 g"]
+    system: System,
+    w: Float[Array, "rows 3 block"],
+    root: Float[Array, "points 6"],
+    z_shared: Float[Array, "points 3 g"],
 ) -> tuple[Float[Array, "rows 3 block"], Float[Array, "runs block columns"]]:
     """Return Z of every row, and `Z^T [Z Z_k]` of every run."""
     of_points = jnp.concatenate([root, z_shared.reshape(root.shape[0], 3 * z_shared.shape[-1])], axis=1)
@@ -156,7 +165,7 @@ def _eliminate_rows(
         left, right = (a.reshape(-1, 3 * ROW_RUN, a.shape[-1]) for a in (z, jnp.concatenate([z, shared], axis=-1)))
         return None, (z, jnp.einsum("rka,rkb->rab", left, right))
 
-    point_index = system.reprojection.point_index.reshape(-1, rows)
+    point_index = jnp.asarray(system.reprojection.point_index).reshape(-1, rows)
     _, (z, products) = jax.lax.scan(chunk, None, (w.reshape(-1, rows, *w.shape[1:]), point_index))
     return z.reshape(w.shape), products.reshape(-1, *products.shape[2:])
 
@@ -201,9 +210,11 @@ def _sum_pairs(system: System, z: Float[Array, "rows 3 block"]) -> Float[Array, 
         first, second = (rows_of(z, p).reshape(p.shape[0], -1, shape.block) for p in pairs)
         return None, jnp.einsum("rka,rkb->rab", first, second)
 
-    _, runs = jax.lax.scan(chunk, None, (system.pair_first, system.pair_second))
+    _, runs = jax.lax.scan(chunk, None, (jnp.asarray(system.pair_first), jnp.asarray(system.pair_second)))
     runs = runs.reshape(-1, shape.block, shape.block)
-    return -jax.ops.segment_sum(runs, system.pair_block, num_segments=shape.num_blocks, indices_are_sorted=True, mode="promise_in_bounds")
+    return -jax.ops.segment_sum(
+        runs, system.pair_block, num_segments=shape.num_blocks, indices_are_sorted=True, mode="promise_in_bounds"
+    )
 
 
 def _add_prior(
@@ -215,14 +226,12 @@ def _add_prior(
 ) -> tuple[Array, Array, Array]:
     """Add a prior's `J^T J` over poses, intrinsics and lever arm; no prior couples a point to anything else."""
     shape = system.shape
-    refined = refined_columns(system)
     lever = slice(shape.border - 3, shape.border)
     if rows.pose is not None:
-        products = jnp.einsum("cin,cjn->nij", rows.pose, rows.pose)
-        diagonal = diagonal.at[:, :6, :6].add(segments(products, rows.pose_index, shape.num_images))
+        diagonal = diagonal.at[:, :6, :6].add(block_products(rows.pose, shape.num_images))
     if rows.intrinsics is not None:
-        columns = rows.intrinsics[:, refined]
-        products = segments(jnp.einsum("cin,cjn->nij", columns, columns), rows.camera_index, shape.num_cameras)
+        refined = rows.intrinsics.jacobian[:, refined_columns(system)]
+        products = block_products(Block(rows.intrinsics.index, refined), shape.num_cameras)
         if shape.own_cameras:
             diagonal = diagonal.at[:, 6:, 6:].add(products)
         elif shape.num_refined:
@@ -230,8 +239,8 @@ def _add_prior(
     if rows.lever_arm is not None and shape.lever_arm:
         corner = corner.at[lever, lever].add(jnp.einsum("cin,cjn->ij", rows.lever_arm, rows.lever_arm))
         if rows.pose is not None:
-            products = jnp.einsum("cin,cjn->nij", rows.pose, rows.lever_arm)
-            border = border.at[:, :6, lever].add(segments(products, rows.pose_index, shape.num_images))
+            products = jnp.einsum("cin,cjn->nij", rows.pose.jacobian, rows.lever_arm)
+            border = border.at[:, :6, lever].add(segments(products, rows.pose.index, shape.num_images))
     return diagonal, border, corner
 
 

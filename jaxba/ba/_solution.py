@@ -1,7 +1,6 @@
 """What `solve` returns: the adjusted unknowns, how the solver got there and what it left out."""
 
 import dataclasses
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -11,6 +10,7 @@ from jaxtyping import Float, Int
 
 from jaxba.ba._check import Dropped
 from jaxba.ba._problem import Problem
+from jaxba.ba._rows import Unknowns
 from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
 from jaxba.geometry import AbstractCamera, Pose
 
@@ -28,11 +28,11 @@ _ADVICE = {
     "ftol": "Converged: the cost no longer changes (ftol).",
     "xtol": "Converged: the unknowns no longer change (xtol).",
     "gtol": "Converged: the gradient is zero (gtol).",
-    "max_nfev": "Not converged after max_nfev steps. Continue from here with more, or, if the cost is still high, look at the "
-    "input: wrong focal length, wrong matches under a loss that is not robust.",
-    "stuck": "Not converged: no step lowers the cost. Look for points at infinity or images with few points; a robust loss, "
-    "priors or fixed intrinsics make such problems better posed.",
-    "not_finite": "Not started: the cost at the start values is not finite. Some point may lie in a camera's own plane.",
+    "max_nfev": "Not converged after max_nfev steps. Continue from here with more, or, if the cost is still high, look at "
+    "the input: wrong focal length, wrong matches under a loss that is not robust.",
+    "stuck": "Not converged: no step lowers the cost. Look for points at infinity or images with few points; a robust "
+    "loss, priors or fixed intrinsics make such problems better posed.",
+    "not_finite": "Not started: the cost at the start values is not finite. Some point may lie in a camera's plane.",
     "interrupted": "Interrupted: these are the values reached so far.",
 }
 
@@ -122,7 +122,6 @@ class Solution(eqx.Module):
         return eqx.tree_at(unknowns, problem, (self.poses, self.cameras, self.points, self.lever_arm))
 
 
-def to_host(tree: eqx.Module) -> eqx.Module:
-    """Return the tree with numpy arrays in place of jax's."""
-    as_numpy: Callable[[object], object] = lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf  # noqa: E731
-    return jax.tree.map(as_numpy, tree)
+def to_host(tree: Unknowns) -> Unknowns:
+    """Return the unknowns with numpy arrays in place of jax's."""
+    return jax.tree.map(np.asarray, tree)

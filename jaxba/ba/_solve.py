@@ -76,7 +76,9 @@ def solve(
     solver = _SOLVERS[method](rtol=ftol, atol=gtol, xtol=xtol)
     if is_traced((problem, loss)):
         if plan is None:
-            raise JaxbaError("solve inside jit, vmap or a derivative needs plan=jaxba.make_plan(problem), made outside.")
+            raise JaxbaError(
+                "solve inside jit, vmap or a derivative needs plan=jaxba.make_plan(problem), made outside."
+            )
         return _solve_traced(problem, loss, solver, plan, max_nfev)
     # OpenBLAS's threads fight with XLA's for the cores (with them a 144 x 144 Cholesky took 204 ms instead of 0.16 ms),
     # so OpenBLAS gets one thread for as long as this runs

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
@@ -265,9 +266,12 @@ def _step_bounds(system: System, unknowns: Unknowns) -> tuple[Array | None, Arra
         return None, None
     infinite = jnp.full(3, jnp.inf, unknowns.points.dtype)
 
-    def border(bound: Array, lever_arm: Array) -> Array:
+    def border(bound: Array | np.ndarray, lever_arm: Array) -> Array:
         like = Step(
-            jnp.zeros((system.shape.num_images, 6), bound.dtype), bound - unknowns.intrinsics, lever_arm, unknowns.points
+            jnp.zeros((system.shape.num_images, 6), bound.dtype),
+            bound - unknowns.intrinsics,
+            lever_arm,
+            unknowns.points,
         )
         vector: ReducedVector = to_reduced(system, like)
         return vector.border

@@ -92,7 +92,9 @@ def initial_unknowns(problem: Problem, plan: Plan, dtype: Any = np.float64) -> U
     xp = _namespace(problem)
     shape = plan.shape
     quaternion = _padded(xp, problem.poses.quaternion, plan.image_order, shape.num_images, 0.0, dtype)
-    quaternion = xp.concatenate([quaternion[: len(plan.image_order)], _identity(shape.num_images - len(plan.image_order))])
+    quaternion = xp.concatenate(
+        [quaternion[: len(plan.image_order)], _identity(shape.num_images - len(plan.image_order))]
+    )
     names = type(problem.cameras).parameter_names()
     parameters = xp.stack([xp.asarray(getattr(problem.cameras, name), dtype) for name in names], axis=-1)
     cameras = _cameras_in_order(plan, problem.num_cameras, np.asarray(problem.camera_index))

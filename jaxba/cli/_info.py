@@ -88,9 +88,9 @@ def components(problem: Problem) -> list[list[str]]:
     return [[image_name(problem, i) for i in group] for group in sorted(groups, key=len, reverse=True)]
 
 
-def image_name(problem: Problem, index: int) -> str:
+def image_name(problem: Problem, index: int | np.integer) -> str:
     """Return an image's name, or its number where it has none."""
-    return problem.image_names[index] if problem.image_names else str(index)
+    return problem.image_names[int(index)] if problem.image_names else str(index)
 
 
 def initial_costs(prepared: Prepared) -> dict[str, float]:
@@ -142,7 +142,7 @@ def text(found: dict[str, Any]) -> str:
 
 
 def _prior_facts(prior: AbstractPrior) -> dict[str, Any]:
-    """Return a prior's rows and, of each of its sigmas, the median of the finite ones in each column (NaN without any)."""
+    """Return a prior's rows and the median of the finite sigmas in each column, NaN without any."""
     sigmas = {name: np.asarray(value, float) for name, value in vars(prior).items() if name.startswith("std")}
     rows = len(next(iter(sigmas.values())))
     medians = {
@@ -192,5 +192,6 @@ def _histogram(lengths: dict[int, int]) -> list[str]:
         counts[_LONGEST] = longer
     top = max(counts.values())
     return [
-        f"{n:>3}{'+' if n == _LONGEST else ' '} {c:>8} {'#' * round(_BAR * c / top)}".rstrip() for n, c in counts.items()
+        f"{n:>3}{'+' if n == _LONGEST else ' '} {c:>8} {'#' * round(_BAR * c / top)}".rstrip()
+        for n, c in counts.items()
     ]

@@ -67,7 +67,10 @@ def solve(
 
 @app.command(help="Tell sizes, track lengths, connectivity, gauge, priors, and what is free.")
 def info(
-    file: _File, /, *, json: Annotated[bool, Parameter(negative="", help="Print one JSON object.")] = False
+    file: _File,
+    /,
+    *,
+    json: Annotated[bool, Parameter(negative="", show_default=False, help="Print one JSON object.")] = False,
 ) -> int:
     from jaxba.cli._info import run
 
@@ -86,7 +89,9 @@ def synthetic(
     points_per_image: Annotated[float, Parameter(help="Tie points over images.")] = 66.0,
     pixel_std: Annotated[float, Parameter(help="Noise of the measured pixels, px an axis.")] = 0.5,
     control: Annotated[int, Parameter(help="Control points.")] = 0,
-    gnss: Annotated[bool, Parameter(negative="--no-gnss", help="Measured positions; without, the gauge is free.")] = True,
+    gnss: Annotated[
+        bool, Parameter(negative="--no-gnss", help="Measured positions; without, the gauge is free.")
+    ] = True,
 ) -> int:
     from jaxba.cli._synthetic import run
 

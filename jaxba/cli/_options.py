@@ -14,33 +14,49 @@ class SolveOptions:
     """What `solve` takes beside its file; the help texts say what each is."""
 
     loss: Annotated[LossName, Parameter(help="Robust loss of the reprojections.")] = "linear"
-    f_scale: Annotated[float, Parameter(help="Where the loss turns robust, in sigmas of a pixel.")] = 1.0
-    alpha: Annotated[float | None, Parameter(help="Shape of the barron loss: 2 least squares, lower is stronger.")] = None
+    f_scale: Annotated[float, Parameter(help="Where the loss turns robust, in sigmas of a pixel; linear has none.")] = (
+        1.0
+    )
+    alpha: Annotated[float | None, Parameter(help="Shape of the barron loss: 2 least squares, lower is stronger.")] = (
+        None
+    )
     method: Annotated[Literal["lm", "dogleg"], Parameter(help="lm is Levenberg-Marquardt.")] = "lm"
     linear_solver: Annotated[
         Literal["auto", "dense", "banded", "cg"], Parameter(help="How the reduced system is solved.")
     ] = "auto"
     max_nfev: Annotated[int, Parameter(help="The most steps tried.")] = 500
-    ftol: Annotated[float, Parameter(help="Stop when the cost changes by less than this share of it.")] = 1e-8
-    xtol: Annotated[float, Parameter(help="Stop when the unknowns change by less than this share of them.")] = 1e-8
+    ftol: Annotated[float, Parameter(help="Stop when the cost changes by less than this share.")] = 1e-8
+    xtol: Annotated[float, Parameter(help="Stop when the unknowns change by less than this share.")] = 1e-8
     gtol: Annotated[float, Parameter(help="Stop when no entry of the gradient is larger.")] = 1e-10
     bounds: Annotated[
         tuple[str, ...],
-        Parameter(help="Bounds on an intrinsic, again for each: focal=0.9,1.1 (of the start value), k1=-0.1,0.1."),
+        Parameter(
+            negative="",
+            show_default=False,
+            help="Bounds on an intrinsic: focal=0.9,1.1 (times the start value) or k1=-0.1,0.1; once for each.",
+        ),
     ] = ()
     fix: Annotated[
         tuple[str, ...],
-        Parameter(help="What to hold fixed: intrinsics, poses, points or intrinsics by name, separated by commas."),
+        Parameter(
+            negative="",
+            show_default=False,
+            help="What to hold fixed: intrinsics, poses, points, or intrinsics by name, separated by commas.",
+        ),
     ] = ()
     reject: Annotated[
         Literal["mad"] | None, Parameter(help="Leave out errors over median + factor x MAD, and solve again.")
     ] = None
-    rounds: Annotated[int | None, Parameter(help="How often at most, with --reject: 2 if not given.")] = None
+    rounds: Annotated[int | None, Parameter(help="How often --reject does so at most. [default: 2]")] = None
     mad_factor: Annotated[float, Parameter(help="Factor of the MAD, for the inlier rate and --reject.")] = 2.5
     out: Annotated[
         Path | None,
-        Parameter(help="Output: a tile, or BAL text where it ends in .txt or .txt.bz2. FILE's name with .solved.npz."),
+        Parameter(
+            help="Output: a tile, or BAL text where it ends in .txt or .txt.bz2. [default: NAME.solved.npz beside FILE]"
+        ),
     ] = None
-    json: Annotated[bool, Parameter(negative="", help="Print one JSON object on standard output.")] = False
-    quiet: Annotated[bool, Parameter(negative="", help="Print no progress and no summary.")] = False
-    verbose: Annotated[bool, Parameter(negative="", help="Print a line a step.")] = False
+    json: Annotated[
+        bool, Parameter(negative="", show_default=False, help="Print one JSON object on standard output.")
+    ] = False
+    quiet: Annotated[bool, Parameter(negative="", show_default=False, help="Print no progress and no summary.")] = False
+    verbose: Annotated[bool, Parameter(negative="", show_default=False, help="Print a line a step.")] = False

@@ -106,7 +106,7 @@ def summary(run: Run) -> str:
     )
     seconds = f"{report.seconds_setup:.2f} s setup, {report.seconds_compile:.2f} s compile"
     rejected = [f"round {i + 1}: {many(n, 'observation')}" for i, n in enumerate(run.found.num_rejected)]
-    bounds = at_bounds(run)
+    bounds, factor = at_bounds(run), run.options.mad_factor
     return table(
         (
             ("problem", f"{run.file}: {', '.join(sizes)}"),
@@ -117,13 +117,15 @@ def summary(run: Run) -> str:
             ("rejected", rejected),
             ("gauge", gauge_text(report.free_gauge)),
             ("errors", f"median {found.median_px:.3f} px, MAD {found.mad_px:.3f} px, rms {found.rms_px:.3f} px"),
-            ("inliers", f"{found.inlier_rate:.1%} within {found.threshold_px:.3f} px (median + "
-                        f"{run.options.mad_factor:g} MAD)"),
+            (
+                "inliers",
+                f"{found.inlier_rate:.1%} of all, within {found.threshold_px:.3f} px (median + {factor:g} MAD)",
+            ),
             ("intrinsics", _refined(run)),
             ("at bounds", first_of(bounds, _MOST_BOUNDS) if bounds else []),
             ("written", str(run.out)),
         )
-    )  # fmt: skip
+    )
 
 
 def hints(run: Run) -> list[str]:
@@ -136,13 +138,13 @@ def hints(run: Run) -> list[str]:
         )
     if found.median_px > _LARGE_MEDIAN_PX:
         texts.append(
-            f"The median error of {found.median_px:.2f} px is large: check the focal length against the sensor's, and for "
-            "images of another camera."
+            f"The median error of {found.median_px:.2f} px is large: check the focal length against the "
+            "sensor's, and for images of another camera."
         )
     if at_bounds(run):
         texts.append(
-            "Intrinsics lie at their bounds, where self-calibration absorbs model error: fix them, add oblique images or "
-            "control points, or use another loss."
+            "Intrinsics lie at their bounds, where self-calibration absorbs model error: fix them, add oblique "
+            "images or control points, or use another loss."
         )
     return texts
 

@@ -17,7 +17,7 @@ from jaxba.cli._cache import use_compilation_cache
 from jaxba.cli._options import SolveOptions
 from jaxba.cli._result import Run, facts, summary
 from jaxba.cli._text import to_json
-from jaxba.geometry import LOSSES, AbstractLoss
+from jaxba.geometry import LOSSES, AbstractLoss, Barron
 from jaxba.io import read_problem, refuse_same_file, write_bal, write_tile
 from jaxba.io._bal import _what_bal_cannot_hold
 
@@ -61,14 +61,13 @@ def make_loss(options: SolveOptions) -> AbstractLoss:
     """
     if not 0 < options.f_scale < math.inf:
         raise JaxbaError(f"--f-scale {options.f_scale:g}: give a positive number, such as 1.")
-    scale = {"f_scale": options.f_scale}
     if options.alpha is None:
-        return LOSSES[options.loss](**scale)
+        return LOSSES[options.loss](f_scale=options.f_scale)
     if options.loss != "barron":
         raise JaxbaError(f"--alpha {options.alpha:g}: only --loss barron has a shape; this is --loss {options.loss}.")
     if math.isnan(options.alpha) or options.alpha > 2:
         raise JaxbaError(f"--alpha {options.alpha:g}: give 2 (least squares) or less.")
-    return LOSSES["barron"](alpha=options.alpha, **scale)
+    return Barron(alpha=options.alpha, f_scale=options.f_scale)
 
 
 def parse_bounds(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -186,7 +185,7 @@ def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Reje
 
 
 def _write(out: Path, given: Problem, problem: Problem, found: Rejected) -> None:
-    """Write the solution: a tile with the options' fixed blocks and bounds in it, or BAL text, which has no room for them."""
+    """Write the solution: a tile, with what the options fixed and bounded, or BAL text, which has no room for that."""
     if out.name.endswith(_BAL_ENDINGS):
         write_bal(out, found.solution.apply(given))
         return

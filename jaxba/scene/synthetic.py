@@ -292,9 +292,7 @@ def _vary(rng: np.random.Generator, camera: AbstractCamera, num_cameras: int) ->
     return type(camera)(*columns)
 
 
-def _start_cameras(
-    cameras: AbstractCamera, focal_error: float, center_px: Float[np.ndarray, "2"]
-) -> AbstractCamera:
+def _start_cameras(cameras: AbstractCamera, focal_error: float, center_px: Float[np.ndarray, "2"]) -> AbstractCamera:
     """Return the cameras with wrong focal lengths, centred principal points and no distortion."""
     columns = []
     for name in cameras.parameter_names():

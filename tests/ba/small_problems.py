@@ -1,8 +1,10 @@
 """Small bundle adjustment problems of every camera model, with every prior."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from scipy.spatial.transform import Rotation
 
 from jaxba.ba import (
@@ -18,6 +20,11 @@ from jaxba.geometry import (
     BAL,
     AbstractCamera,
     AbstractLoss,
+    Arctan,
+    Barron,
+    Cauchy,
+    GemanMcClure,
+    Huber,
     Linear,
     OpenCV,
     OpenCVFisheye,
@@ -26,6 +33,8 @@ from jaxba.geometry import (
     Radial,
     SimplePinhole,
     SimpleRadial,
+    SoftL1,
+    Tukey,
 )
 
 EVERY_CAMERA = (
@@ -38,6 +47,31 @@ EVERY_CAMERA = (
     BAL(f=800.0, k1=-0.05, k2=0.02),
 )
 """One camera of every model."""
+
+RADIAL = EVERY_CAMERA[3]
+
+
+class OneOf(AbstractLoss):
+    """The loss at `index` of `LOSSES`, chosen at run time, so that one compilation serves all of them."""
+
+    index: Array
+    f_scale: Array
+
+    def rho(self, z: Array) -> Array:
+        # a number among numbers: the solver's systems hold losses as floats
+        return jax.lax.switch(jnp.asarray(self.index).astype(jnp.int32), [loss.rho for loss in LOSSES], z)
+
+
+LOSSES = (
+    *(Linear(), SoftL1(1.5), Huber(1.5), Cauchy(2.0), Arctan(6.0)),
+    *(Tukey(15.0), GemanMcClure(6.0), Barron(alpha=-1.0, f_scale=4.0), Barron(alpha=1.5, f_scale=2.0)),
+)
+"""Every loss, with a scale that leaves most of a small problem's residuals their influence."""
+
+
+def one_of(index: int) -> OneOf:
+    """Return `LOSSES[index]` as a loss that shares its compilation with the others."""
+    return OneOf(jnp.array(float(index)), jnp.array(LOSSES[index].f_scale, float))
 
 
 def small_problem(

@@ -37,13 +37,13 @@ def block(num_lines: int = 2, *, nadir: bool = False) -> Problem:
 
 
 def positions(problem: Problem, images: range = range(8), std_m: float = 0.05) -> PositionPrior:
-    index = np.array(images)
+    index = np.array(images, int)
     xyz = np.asarray(problem.poses.center)[index]
     return PositionPrior(image_index=index, xyz=xyz, std_m=np.full((len(index), 3), std_m))
 
 
 def attitudes(problem: Problem, images: range) -> AttitudePrior:
-    index = np.array(images)
+    index = np.array(images, int)
     quaternion = np.asarray(problem.poses.quaternion)[index]
     return AttitudePrior(image_index=index, quaternion=quaternion, std_rad=np.full((len(index), 3), 0.01))
 

@@ -1,40 +1,25 @@
 """Gradient, diagonal and curvature of the quadratic model equal those of the dense reference, for every robust loss."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense_reference import Dense, in_own_order, solver_view
 from jax import Array
-from small_problems import EVERY_CAMERA, small_problem
+from small_problems import LOSSES, RADIAL, one_of, small_problem
 
-from jaxba.ba import Step
+from jaxba.ba import Problem, Step, Unknowns
 from jaxba.ba._linearise import cost, curvature, linearise
 from jaxba.ba._system import System
-from jaxba.geometry import (
-    AbstractLoss,
-    Arctan,
-    Barron,
-    Cauchy,
-    GemanMcClure,
-    Huber,
-    Linear,
-    Radial,
-    SoftL1,
-    Tukey,
-)
-
-RADIAL = next(camera for camera in EVERY_CAMERA if isinstance(camera, Radial))
-LOSSES = (
-    *(Linear(), SoftL1(1.5), Huber(1.5), Cauchy(2.0), Arctan(6.0)),
-    *(Tukey(30.0), GemanMcClure(6.0), Barron(alpha=-1.0, f_scale=4.0)),
-)
+from jaxba.geometry import AbstractLoss, Cauchy, Huber
 
 
-def random_step(like: Step, free: Step, seed: int = 0) -> Step:
+def random_step(free: Step) -> Step:
     """A step of everything that is free."""
-    rng = np.random.default_rng(seed)
-    return jax.tree.map(lambda leaf, mask: jnp.asarray(rng.normal(size=leaf.shape) * np.asarray(mask)), like, free)
+    rng = np.random.default_rng(0)
+    return jax.tree.map(lambda mask: jnp.asarray(rng.normal(size=mask.shape) * np.asarray(mask)), free)
 
 
 def triggs_hessian(dense: Dense, bend: float) -> np.ndarray:
@@ -51,19 +36,28 @@ def triggs_hessian(dense: Dense, bend: float) -> np.ndarray:
     return total
 
 
-def assert_model_is_dense(problem, loss: AbstractLoss, bend: float) -> None:
+class Model(NamedTuple):
+    """The solver's model at the start, its curvature along a step, and the gradient that jax gives of the cost."""
+
+    gradient: Step
+    diagonal: Step
+    along: Array
+    slope: Step
+    cost: Array
+
+
+@jax.jit
+def model_of(system: System, start: Unknowns, step: Step, bend: float) -> Model:
+    model = linearise(system, start, bend)
+    slope = jax.grad(lambda s: cost(system, start.retract(s)))(jax.tree.map(jnp.zeros_like, step))
+    return Model(model.gradient, model.diagonal, curvature(system, model, step), slope, cost(system, start))
+
+
+def assert_model_is_dense(problem: Problem, loss: AbstractLoss, bend: float) -> None:
     plan, system, start = solver_view(problem, loss)
     dense = Dense(problem, loss)
-    step = random_step(system.free, system.free)
-
-    @jax.jit
-    def every(system: System) -> tuple[Step, Step, Array, Step, Array]:
-        model = linearise(system, start, bend)
-        zero = jax.tree.map(jnp.zeros_like, step)
-        slope = jax.grad(lambda s: cost(system, start.retract(s)))(zero)
-        return model.gradient, model.diagonal, curvature(system, model, step), slope, cost(system, start)
-
-    gradient, diagonal, along, slope, value = every(system)
+    step = random_step(system.free)
+    gradient, diagonal, along, slope, value = model_of(system, start, step, bend)
     np.testing.assert_allclose(value, dense.cost(np.zeros(dense.size)), rtol=1e-12)
     expected = dense.square_rooted_jacobian(np.zeros(dense.size)).T @ dense.square_rooted(np.zeros(dense.size))
     hessian = triggs_hessian(dense, bend)
@@ -85,12 +79,10 @@ def assert_model_is_dense(problem, loss: AbstractLoss, bend: float) -> None:
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.9])
-@pytest.mark.parametrize("loss", LOSSES, ids=repr)
-def test_model_of_every_loss_is_the_dense_one(loss, bend):
-    if bend and isinstance(loss, Linear):
-        pytest.skip("least squares has no curvature to hold back")
+@pytest.mark.parametrize("index", range(len(LOSSES)), ids=lambda i: repr(LOSSES[i]))
+def test_model_of_every_loss_is_the_dense_one(index, bend):
     problem = small_problem(RADIAL, lever_arm=True, prior_loss=Cauchy(3.0), num_outliers=3)
-    assert_model_is_dense(problem, loss, bend)
+    assert_model_is_dense(problem, one_of(index), bend)
 
 
 @pytest.mark.parametrize("num_cameras", [2, 6])

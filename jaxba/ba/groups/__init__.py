@@ -9,8 +9,7 @@ from jaxba.ba.groups._position import PositionPrior
 from jaxba.ba.groups._reprojection import Reprojection
 
 PRIORS: dict[str, type[AbstractPrior]] = {
-    prior.name: prior
-    for prior in (PositionPrior, AttitudePrior, IntrinsicsPrior, ControlPointPrior, LeverArmPrior)
+    prior.name: prior for prior in (PositionPrior, AttitudePrior, IntrinsicsPrior, ControlPointPrior, LeverArmPrior)
 }
 """Every prior that a problem can hold, by name; files and messages are driven by this table."""
 

@@ -21,7 +21,7 @@ class LeverArmPrior(AbstractPrior):
     loss: AbstractLoss = Linear()
 
     def residual(self, unknowns: Unknowns) -> Float[Array, "3 1"]:
-        return ((unknowns.lever_arm[None] - self.xyz) / jnp.asarray(self.std_m)).T
+        return ((jnp.asarray(unknowns.lever_arm)[None] - self.xyz) / jnp.asarray(self.std_m)).T
 
     def rows(self, unknowns: Unknowns) -> Rows:
         derivative = jnp.eye(3, dtype=unknowns.lever_arm.dtype) / jnp.asarray(self.std_m).T

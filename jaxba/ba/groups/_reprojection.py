@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
@@ -36,11 +37,11 @@ class Reprojection(eqx.Module):
     - `refined`: which of the model's parameters get derivative columns (static).
     """
 
-    xy_px: Float[Array, "2 runs lanes"]
-    weight: Float[Array, "runs lanes"]
-    point_index: Int[Array, "runs lanes"]
-    run_image: Int[Array, " runs"]
-    camera_index: Int[Array, " images"]
+    xy_px: Float[Array | np.ndarray, "2 runs lanes"]
+    weight: Float[Array | np.ndarray, "runs lanes"]
+    point_index: Int[Array | np.ndarray, "runs lanes"]
+    run_image: Int[Array | np.ndarray, " runs"]
+    camera_index: Int[Array | np.ndarray, " images"]
     model: type[AbstractCamera] = eqx.field(static=True)
     refined: tuple[bool, ...] = eqx.field(static=True)
 

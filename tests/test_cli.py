@@ -1,0 +1,326 @@
+import dataclasses
+import inspect
+import json
+import os
+import subprocess
+import sys
+import time
+import typing
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import jaxba
+from jaxba.cli import _progress, _solve, main
+from jaxba.cli._info import components
+from jaxba.cli._options import LossName, SolveOptions
+from jaxba.cli._text import to_json
+from jaxba.geometry import BAL, LOSSES
+
+Answer = tuple[int, str, str]
+Cli = Callable[..., Answer]
+
+
+@pytest.fixture(autouse=True)
+def no_compilation_cache(monkeypatch: pytest.MonkeyPatch):
+    """The commands run in this process: leave its compilation cache as it is."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
+    """Run a command; return its exit code, standard output and standard error."""
+
+    def call(*arguments: object) -> Answer:
+        with pytest.raises(SystemExit) as stop:
+            main([str(argument) for argument in arguments])
+        return int(stop.value.code or 0), *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def survey() -> jaxba.synthetic.Survey:
+    return jaxba.synthetic.uav_block(6, seed=3, points_per_image=40.0, outlier_fraction=0.02)
+
+
+@pytest.fixture
+def tile(tmp_path: Path, survey: jaxba.synthetic.Survey) -> Path:
+    path = tmp_path / "tile.npz"
+    jaxba.write_tile(path, survey.problem)
+    return path
+
+
+def test_help_answers_within_half_a_second_and_loads_nothing_heavy():
+    code = (
+        "import sys\nfrom jaxba.cli import main\ntry: main(['solve', '--help'])\nexcept SystemExit: pass\n"
+        "print('HEAVY', *{'jax', 'numpy', 'scipy', 'equinox'} & set(sys.modules))"
+    )
+    seconds = []
+    for _ in range(3):  # other programs may take the cores for a while
+        begin = time.perf_counter()
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        seconds.append(time.perf_counter() - begin)
+        assert "--mad-factor" in run.stdout
+        assert run.stdout.splitlines()[-1] == "HEAVY "[:-1]
+    assert min(seconds) < 0.5
+
+
+def test_version_is_that_of_the_package(cli: Cli):
+    assert cli("--version") == (0, f"{jaxba.__version__}\n", "")
+
+
+def test_defaults_and_names_are_those_of_the_python_functions():
+    signature = inspect.signature(jaxba.solve).parameters
+    options = SolveOptions()
+    for name in ("method", "linear_solver", "max_nfev", "ftol", "xtol", "gtol"):
+        assert getattr(options, name) == signature[name].default
+    reject = inspect.signature(jaxba.solve_and_reject).parameters
+    assert (options.mad_factor, _solve._ROUNDS) == (reject["mad_factor"].default, reject["rounds"].default)
+    assert list(typing.get_args(LossName)) == list(LOSSES)
+    assert options.loss == "linear"  # `jaxba.solve(problem)` is least squares too
+
+
+def test_json_tells_what_solve_returns(cli: Cli, tile: Path, survey: jaxba.synthetic.Survey):
+    before = tile.read_bytes()
+    code, out, err = cli("solve", tile, "--json")
+    assert (code, err) == (0, "")
+    assert tile.read_bytes() == before
+    found = json.loads(out)
+    solution = jaxba.solve(survey.problem)
+    assert found["result"] == solution.result == "ftol"
+    assert (found["initial_cost"], found["final_cost"]) == (solution.initial_cost, solution.final_cost)
+    assert found["plain_cost"] == found["final_cost"]
+    errors = jaxba.quality(solution.apply(survey.problem))
+    assert (found["median_error_px"], found["inlier_rate"]) == (errors.median_px, errors.inlier_rate)
+    assert found["num_images"] == 6
+    assert found["num_points"] == survey.problem.num_points
+    assert found["num_observations"] == survey.problem.num_observations
+    assert min(found[f"seconds_{part}"] for part in ("setup", "compile", "solve")) >= 0
+    assert [step["step"] for step in found["history"]] == list(range(found["num_steps"] + 1))
+    assert set(found["history"][0]) == {"step", "seconds", "cost", "accepted"}
+    assert found["history"][-1]["cost"] == found["final_cost"]
+    assert found["history"][-1]["seconds"] <= found["seconds_solve"]
+    assert found["intrinsics"]["fx"]["after"] == list(solution.cameras.fx)
+    assert any("--loss huber" in hint for hint in found["hints"])  # 2% outliers under least squares
+
+
+def test_solved_tile_holds_the_solution_and_masks(cli: Cli, tile: Path, survey: jaxba.synthetic.Survey):
+    code, out, _ = cli("solve", tile, "--loss", "huber", "--reject", "mad", "--rounds", 1, "--fix", "k1,k2")
+    path = tile.with_name("tile.solved.npz")
+    assert (code, out.splitlines()[-1].split()) == (0, ["written", str(path)])
+    assert "rejected" in out and "without the loss" in out
+    problem = survey.problem.fix(intrinsics=["k1", "k2"])
+    expected = jaxba.solve_and_reject(problem, rounds=1, loss=jaxba.Huber(1.0))
+    solved = jaxba.read_tile(path)
+    np.testing.assert_array_equal(solved.points, expected.solution.points)
+    np.testing.assert_array_equal(solved.cameras.k1, survey.problem.cameras.k1)
+    np.testing.assert_array_equal(solved.free.intrinsics, problem.free.intrinsics)
+    with np.load(path) as arrays:
+        np.testing.assert_array_equal(arrays["extra_is_used"], expected.used)
+        np.testing.assert_array_equal(arrays["extra_is_inlier"], expected.quality.is_inlier)
+        np.testing.assert_array_equal(arrays["extra_error_px"], expected.quality.error_px)
+
+
+def test_not_converged_is_written_all_the_same_and_exits_with_1(cli: Cli, tile: Path):
+    code, out, _ = cli("solve", tile, "--max-nfev", 1, "--verbose")
+    assert code == 1
+    assert "Not converged after max_nfev steps" in out
+    assert out.split()[:3] == ["step", "cost", "change"]
+    assert tile.with_name("tile.solved.npz").exists()
+
+
+def test_active_bound_is_named_with_what_to_do(cli: Cli, tile: Path):
+    code, out, _ = cli("solve", tile, "--bounds", "focal=0.995,1.1", "--bounds", "k1=-1,1")
+    assert code == 0
+    assert "fx at its lower bound 3670.08, fy at its lower bound 3667.06" in out  # 0.995 x 3688.52, 3685.49
+    assert "fix them, add oblique images" in out
+
+
+def test_quiet_prints_nothing(cli: Cli, tile: Path):
+    assert cli("solve", tile, "--quiet") == (0, "", "")
+
+
+def test_interrupt_writes_what_was_reached_and_exits_with_130(
+    cli: Cli, tile: Path, survey: jaxba.synthetic.Survey, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupt(step: object, stream: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_progress, "print_step", interrupt)
+    code, out, err = cli("solve", tile, "--json", "--verbose")
+    found = json.loads(out)
+    assert (code, found["result"], found["num_steps"]) == (130, "interrupted", 1)
+    assert "holds the values reached so far" in err
+    assert np.any(jaxba.read_tile(tile.with_name("tile.solved.npz")).points != survey.problem.points)
+
+
+def test_interrupt_before_the_first_step_writes_nothing(cli: Cli, tile: Path, monkeypatch: pytest.MonkeyPatch):
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_solve, "read_problem", interrupt)
+    assert cli("solve", tile) == (130, "", "jaxba: interrupted; nothing was written.\n")
+    assert os.listdir(tile.parent) == ["tile.npz"]
+
+
+def test_progress_line_is_shown_on_a_terminal_and_removed(cli: Cli, tile: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    _, out, err = cli("solve", tile)
+    assert "\x1b" not in out
+    assert "\x1b[Kstep 1 " in err and err.endswith("\r\x1b[K")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["solve", "absent.npz"], "absent.npz: no such file"),
+        (["solve", "TILE", "--loss", "hubert"], 'Invalid value "hubert" for --loss'),
+        (["solve", "TILE", "--lss", "huber"], "Unknown option"),
+        (["solve"], "FILE"),
+        (["slove", "TILE"], 'Unknown command "slove"'),
+        (["solve", "TILE", "--f-scale", "0"], "--f-scale 0: give a positive number"),
+        (["solve", "TILE", "--f-scale", "nan"], "--f-scale nan: give a positive number"),
+        (["solve", "TILE", "--alpha", "1"], "--alpha 1: only --loss barron"),
+        (["solve", "TILE", "--max-nfev", "0"], "--max-nfev 0: give 1 or more"),
+        (["solve", "TILE", "--ftol", "-1"], "--ftol -1: give 0"),
+        (["solve", "TILE", "--bounds", "focal"], "--bounds focal: give a name, = and two numbers"),
+        (["solve", "TILE", "--bounds", "focal=1,2,3"], "--bounds focal=1,2,3: give a name"),
+        (["solve", "TILE", "--bounds", "focal=1.1,0.9"], "the lower bound must be below the upper"),
+        (["solve", "TILE", "--bounds", "k9=0,1"], "OpenCV camera has focal, fx"),
+        (["solve", "TILE", "--bounds", "k1=0,1", "--bounds", "k1=0,2"], "k1 has bounds already"),
+        (["solve", "TILE", "--bounds", "focal=1.05,1.1"], "outside its bounds"),
+        (["solve", "TILE", "--fix", "fx,zoom"], "--fix zoom: choose from intrinsics, poses, points"),
+        (["solve", "TILE", "--fix", "poses,points,intrinsics"], "Nothing is free"),
+        (["solve", "TILE", "--rounds", "2"], "Add --reject mad"),
+        (["solve", "TILE", "--mad-factor", "0"], "--mad-factor 0: give a positive number"),
+        (["solve", "TILE", "--out", "TILE"], "the output is the input"),
+        (["solve", "TILE", "--out", "absent/out.npz"], "there is no folder"),
+        (["solve", "TILE", "--out", "out.txt"], "BAL cannot hold OpenCV cameras"),
+        (["solve", "TRUNCATED"], "truncated or damaged"),
+        (["solve", "TEXT"], "'hello' is not a finite number"),
+        (["info", "TEXT"], "'hello' is not a finite number"),
+        (["synthetic", "out.npz", "--images", "1"], "num_images=1 is out of range"),
+        (["synthetic", "absent/out.npz"], "no such file or directory"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    cli: Cli, tile: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+):
+    monkeypatch.chdir(tile.parent)
+    truncated, text = tile.with_name("truncated.npz"), tile.with_name("hello.txt")
+    truncated.write_bytes(tile.read_bytes()[:3000])
+    text.write_text("hello")
+    names = {"TILE": tile.name, "TRUNCATED": truncated.name, "TEXT": text.name}
+    before = sorted(os.listdir(tile.parent))
+    code, out, err = cli(*(names.get(argument, argument) for argument in arguments))
+    assert (code, out) == (2, "")
+    assert err.startswith("jaxba: ") and err.count("\n") == 1
+    assert message.lower() in err.lower()
+    assert sorted(os.listdir(tile.parent)) == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_read_only_folder_is_refused_before_the_solve(cli: Cli, tile: Path):
+    tile.parent.chmod(0o500)
+    code, _, err = cli("solve", tile)
+    tile.parent.chmod(0o700)
+    assert code == 2
+    assert "may not be written to" in err
+
+
+def test_bal_problem_is_written_as_bal_where_the_output_ends_in_txt(cli: Cli, tmp_path: Path):
+    survey = jaxba.synthetic.uav_block(
+        4, camera=BAL(3650.0, 0.0, 0.0), num_cameras=4, gnss_std_m=None, pixel_std_px=0.0, points_per_image=30.0
+    )
+    given = eqx.tree_at(lambda p: p.observations.std_px, survey.problem, np.ones(survey.problem.num_observations))
+    problem, solved = tmp_path / "problem.txt", tmp_path / "solved.txt"
+    jaxba.write_bal(problem, given)
+    code, out, _ = cli("solve", problem, "--out", solved, "--fix", "intrinsics", "--max-nfev", 3, "--json")
+    cost = 0.5 * np.sum(jaxba.reprojection_errors(jaxba.read_bal(solved)) ** 2)
+    # BAL's text holds rotation vectors, which round-trip to a few ulp, and the adjusted residuals are differences
+    assert cost == pytest.approx(json.loads(out)["final_cost"], rel=1e-6)
+    assert len(json.loads(out)["free_gauge"]) == 7
+    assert code in (0, 1)
+    assert sorted(os.listdir(tmp_path)) == ["problem.txt", "solved.txt"]
+
+
+def test_info_tells_what_a_problem_holds(cli: Cli, tile: Path, survey: jaxba.synthetic.Survey):
+    code, out, err = cli("info", tile, "--json")
+    assert (code, err) == (0, "")
+    found, problem = json.loads(out), survey.problem
+    lengths = {int(n): count for n, count in found["track_lengths"].items()}
+    assert sum(lengths.values()) == problem.num_points
+    assert sum(n * count for n, count in lengths.items()) == problem.num_observations
+    assert found["camera_model"] == "OPENCV"
+    assert found["components"] == [[str(i) for i in range(6)]]
+    assert found["free"]["intrinsics"]["k3"] == 0 and found["free"]["intrinsics"]["fx"] == 1
+    assert found["free_gauge"] == []
+    assert found["priors"] == [
+        {"name": "position", "rows": 6, "loss": "linear", "median_std": {"std_m": [0.03, 0.03, 0.06]}}
+    ]
+    total = float(jaxba.solve(problem, max_nfev=1).initial_cost)
+    assert sum(found["initial_costs"].values()) == pytest.approx(total, rel=1e-12)
+    code, out, _ = cli("info", tile)
+    assert code == 0
+    assert all(word in out for word in ("connected", "all images hang together", "k3", "position: 6 rows"))
+
+
+def test_images_that_share_no_point_are_told_apart_by_name():
+    problem = jaxba.synthetic.uav_block(6, points_per_image=40.0).problem
+    seen = problem.observations
+    first_two = seen.image_index < 2
+    sees_point = np.bincount(seen.point_index[first_two], minlength=problem.num_points) > 0
+    keep = first_two | ~sees_point[seen.point_index]
+    problem = dataclasses.replace(
+        problem, observations=jax.tree.map(lambda values: values[keep], seen), image_names=tuple("abcdef")
+    )
+    groups = components(problem)
+    assert sorted(name for group in groups for name in group) == list("abcdef")
+    assert ["a", "b"] in groups
+
+
+def test_synthetic_writes_the_same_survey_with_its_truth(cli: Cli, tmp_path: Path):
+    paths = tmp_path / "a.npz", tmp_path / "b.npz"
+    for path in paths:
+        code, out, _ = cli("synthetic", path, "--images", 5, "--seed", 4, "--outliers", 0.05)
+        assert code == 0 and "5 images" in out
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    survey = jaxba.synthetic.uav_block(5, seed=4, outlier_fraction=0.05)
+    np.testing.assert_array_equal(jaxba.read_tile(paths[0]).points, survey.problem.points)
+    with np.load(paths[0]) as arrays:
+        np.testing.assert_array_equal(arrays["extra_truth_point_xyz_m"], survey.truth.points)
+        np.testing.assert_array_equal(arrays["extra_truth_is_outlier"], survey.truth.is_outlier)
+
+
+def test_json_has_null_for_what_is_not_finite():
+    assert to_json({"a": np.array([1.0, np.nan]), "b": float("inf"), 3: (np.int32(2), True)}) == (
+        '{"a": [1.0, null], "b": null, "3": [2, true]}'
+    )
+
+
+@pytest.mark.parametrize("case", ["user's folder", "jax's own variable", "not writable"])
+def test_compilation_cache_is_in_the_users_folder_if_that_can_be(tmp_path: Path, case: str):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    expected, changes = {
+        "user's folder": (str(tmp_path / "jaxba"), {"XDG_CACHE_HOME": str(tmp_path)}),
+        "jax's own variable": (str(tmp_path / "own"), {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own")}),
+        "not writable": ("None", {"XDG_CACHE_HOME": str(blocked)}),
+    }[case]
+    code = (
+        "import jaxba, jax\nfrom jaxba.cli._cache import use_compilation_cache as use\nimport jaxba.ba\n"
+        "before = jax.config.jax_compilation_cache_dir\nuse()\n"
+        "print(before, jax.config.jax_compilation_cache_dir)"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment | changes
+    )
+    before, after = run.stdout.split()
+    assert after == expected
+    assert before == ("None" if case != "jax's own variable" else expected)  # imports alone set nothing

@@ -31,6 +31,7 @@ from jaxba.geometry import Pose
 
 _CHUNK = 256
 _NULL = 1e-12  # eigenvalue over the largest: a direction held a million times more weakly than another counts as free
+_REMOTE = 10.0  # sizes of the part: fixed points beyond count as if they were there
 _NEGLIGIBLE = 0.1  # of a direction's largest component: smaller ones are not named
 
 _NAMES = (
@@ -126,6 +127,7 @@ def _fixed_point_grams(problem: Problem, parts: Parts) -> Float[np.ndarray, "par
     """
     part, index = parts.fixed_points
     x = (np.asarray(problem.points, float)[index] - parts.center[part]) / parts.size[part][:, None]
+    x /= np.maximum(1.0, np.linalg.norm(x, axis=1, keepdims=True) / _REMOTE)
     count = len(parts.size)
     number = np.bincount(part, minlength=count)
     mean = mean_by(x, part, count)

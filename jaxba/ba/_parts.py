@@ -15,6 +15,9 @@ from jaxba.ba._problem import Problem
 from jaxba.ba._projection import rotation_matrices
 from jaxba.geometry import Pose
 
+_TRIMMING_ROUNDS = 6
+_FAR = 4.0  # rms extents
+
 
 @dataclasses.dataclass(frozen=True)
 class Parts:
@@ -53,16 +56,14 @@ class Parts:
         center = _centers(problem)
         both_ends = np.concatenate([center[image[inside]], np.asarray(problem.points)[point[inside]]])
         part_of_end = np.tile(ends[inside], 2)
-        middle = mean_by(both_ends, part_of_end, len(anchored))
-        squared = np.sum((both_ends - middle[part_of_end]) ** 2, axis=1, keepdims=True)
-        size = np.sqrt(mean_by(squared, part_of_end, len(anchored)))
+        middle, size = _extents(both_ends, part_of_end, len(anchored))
         return Parts(
             of_image,
             of_point,
             _pairs(ends, image, inside & ~free_pose),
             (ends[inside & ~free_point], point[inside & ~free_point]),
             middle,
-            np.maximum(size[:, 0], np.finfo(float).tiny),
+            np.maximum(size, np.finfo(float).tiny),
         )
 
     def move_points(self, part: Int[np.ndarray, " n"], xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 7"]:
@@ -82,6 +83,20 @@ class Parts:
         move[:, :3, 3:6] = -rotation
         move[:, 3:] = -rotation @ self.move_points(part, centers)
         return move
+
+
+def _extents(
+    xyz: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"], count: int
+) -> tuple[Float[np.ndarray, "parts 3"], Float[np.ndarray, " parts"]]:
+    """Return mean and rms extent of each part, without what lies far from the rest: one point may be a world away."""
+    middle, size = np.zeros((count, 3)), np.full(count, np.inf)
+    for _ in range(_TRIMMING_ROUNDS):
+        distance = np.linalg.norm(xyz - middle[part], axis=1)
+        near = distance <= _FAR * size[part]
+        middle = mean_by(xyz[near], part[near], count)
+        squared = np.sum((xyz[near] - middle[part[near]]) ** 2, axis=1, keepdims=True)
+        size = np.sqrt(mean_by(squared, part[near], count))[:, 0]
+    return middle, size
 
 
 def mean_by(

@@ -23,16 +23,20 @@ from jaxba.ba._solve import solve
 class Rejected:
     """Result of `solve_and_reject`.
 
-    - `solution`: of the last round.
+    - `solutions`: of each round; `solution` is the last one's.
     - `used`: the observations that the last round used.
     - `quality`: errors of all observations at the solution, statistics over those used.
     - `num_rejected`: rejected before each round after the first.
     """
 
-    solution: Solution
+    solutions: tuple[Solution, ...]
     used: Bool[np.ndarray, " observations"]
     quality: Quality
     num_rejected: tuple[int, ...]
+
+    @property
+    def solution(self) -> Solution:
+        return self.solutions[-1]
 
 
 def solve_and_reject(problem: Problem, *, rounds: int = 2, mad_factor: float = 2.5, **options: Any) -> Rejected:
@@ -51,15 +55,16 @@ def solve_and_reject(problem: Problem, *, rounds: int = 2, mad_factor: float = 2
     used = np.ones(problem.num_observations, bool)
     solution, used = _solve_with(problem, used, options)
     found = quality(solution.apply(problem), used, mad_factor=mad_factor)
-    num_rejected = []
+    num_rejected, solutions = [], [solution]
     for _ in range(rounds):
         fits = found.error_px <= found.threshold_px
         if np.array_equal(fits, used) or solution.result == "interrupted":
             break
         num_rejected.append(int(np.count_nonzero(~fits)))
         solution, used = _solve_with(solution.apply(problem), fits, options)
+        solutions.append(solution)
         found = quality(solution.apply(problem), used, mad_factor=mad_factor)
-    return Rejected(solution, used, found, tuple(num_rejected))
+    return Rejected(tuple(solutions), used, found, tuple(num_rejected))
 
 
 def _solve_with(

@@ -28,7 +28,7 @@ _ADVICE = {
     "ftol": "Converged: the cost no longer changes (ftol).",
     "xtol": "Converged: the unknowns no longer change (xtol).",
     "gtol": "Converged: the gradient is zero (gtol).",
-    "max_nfev": "Not converged after max_nfev steps. Continue from here with more, or, if the cost is still high, look at "
+    "max_nfev": "Not converged after max_nfev steps. Continue with more, or, if the cost is still high, look at "
     "the input: wrong focal length, wrong matches under a loss that is not robust.",
     "stuck": "Not converged: no step lowers the cost. Look for points at infinity or images with few points; a robust "
     "loss, priors or fixed intrinsics make such problems better posed.",
@@ -80,7 +80,8 @@ class Report:
 class Solution(eqx.Module):
     """Adjusted unknowns, in the problem's own order.
 
-    - `initial_cost`, `final_cost`: half the sum of losses over all groups. `plain_cost`: the same without the losses.
+    - `initial_cost`, `final_cost`: half the sum of losses over all groups.
+    - `initial_plain_cost`, `plain_cost`: the same without the losses.
     - `status`: why the solver stopped; `result` names it.
     - `report`: None for a solve inside `jit`, `vmap` or a derivative.
     """
@@ -91,6 +92,7 @@ class Solution(eqx.Module):
     lever_arm: Float[Array | np.ndarray, "3"]
     initial_cost: Float[Array | np.ndarray, ""]
     final_cost: Float[Array | np.ndarray, ""]
+    initial_plain_cost: Float[Array | np.ndarray, ""]
     plain_cost: Float[Array | np.ndarray, ""]
     status: Int[Array | np.ndarray, ""]
     num_steps: Int[Array | np.ndarray, ""]

@@ -110,11 +110,13 @@ def _solve_on_host(
 
     state: State = run.init(unknowns, system)
     history = [HistoryStep(step=0, seconds=0.0, cost=float(state.cost), accepted=True, trust=float(state.trust))]
+    initial_plain_cost = np.asarray(run.cost(plain, unknowns))
     interrupted = False
     try:
         while int(state.status) == RUNNING and len(history) <= max_nfev:
-            unknowns, state = run.step(unknowns, state, system)
-            history.append(_history_step(len(history), started, jax.device_get(state)))
+            reached = run.step(unknowns, state, system)
+            entry = _history_step(len(history), started, jax.device_get(reached[1]))
+            (unknowns, state), _ = reached, history.append(entry)
             if callback is not None:
                 callback(history[-1])
     except KeyboardInterrupt:
@@ -137,6 +139,7 @@ def _solve_on_host(
         lever_arm=values.lever_arm,
         initial_cost=np.asarray(history[0].cost),
         final_cost=np.asarray(state.cost),
+        initial_plain_cost=initial_plain_cost,
         plain_cost=np.asarray(run.cost(plain, unknowns)),
         status=np.asarray(state.status),
         num_steps=np.asarray(len(history) - 1),
@@ -163,6 +166,7 @@ def _solve_traced(
 ) -> Solution:
     dtype = jnp.result_type(float)
     system = make_system(problem, plan, loss, dtype)
+    plain = make_system(_without_losses(problem), plan, Linear(), dtype)
     start = initial_unknowns(problem, plan, dtype)
     found = optx.least_squares(residuals, solver, start, args=system, max_steps=max_nfev, throw=False)
     values = restore(found.value, problem, plan)
@@ -173,7 +177,8 @@ def _solve_traced(
         lever_arm=values.lever_arm,
         initial_cost=cost(system, start),
         final_cost=found.stats["cost"],
-        plain_cost=cost(make_system(_without_losses(problem), plan, Linear(), dtype), found.value),
+        initial_plain_cost=cost(plain, start),
+        plain_cost=cost(plain, found.value),
         status=found.stats["status"],
         num_steps=found.stats["num_steps"],
     )

@@ -61,7 +61,7 @@ class Proposal(NamedTuple):
     linear_iterations: Int[Array, ""]
 
 
-def residuals(unknowns: Unknowns, system: System) -> tuple[Float[Array, "components rows"], ...]:
+def residuals(unknowns: Unknowns, system: System) -> tuple[Float[Array, "components *rows"], ...]:
     """Return every group's robust residuals `sqrt(rho(s) / s) r`, `s = |r|^2`: their squares sum to twice the cost."""
 
     def robust(residual: Array, loss: Callable[[Array], Array]) -> Array:

@@ -26,6 +26,7 @@ app = App(
     version=__version__,
     help_format="plaintext",
     result_action="return_value",
+    suppress_keyboard_interrupt=False,
 )
 
 _File = Annotated[Path, Parameter(help="A tile.npz, or a BAL problem, text or bz2.")]

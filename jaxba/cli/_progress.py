@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TextIO
 
 from jaxba.ba import HistoryStep
 
@@ -12,12 +11,11 @@ _TITLES = ("step", "cost", "change", "gradient", "length", "trust", "linear", "s
 
 
 @contextmanager
-def line(stream: TextIO) -> Iterator[Callable[[HistoryStep], None]]:
-    """Yield a callback that shows the present step on a terminal; the line is gone afterwards."""
+def line() -> Iterator[Callable[[HistoryStep], None]]:
+    """Yield a callback that shows the present step on standard error, a terminal; the line is gone afterwards."""
 
     def show(text: str) -> None:
-        stream.write(f"{_CLEAR}{text}")
-        stream.flush()
+        print(f"{_CLEAR}{text}", end="", file=sys.stderr, flush=True)
 
     show("preparing and compiling ...")
     try:
@@ -26,13 +24,13 @@ def line(stream: TextIO) -> Iterator[Callable[[HistoryStep], None]]:
         show("")
 
 
-def print_step(step: HistoryStep, stream: TextIO | None = None) -> None:
+def print_step(step: HistoryStep, *, to_stderr: bool) -> None:
     """Print a line of the table of steps, with its titles before the first one.
 
     `trust` is the damping (lm) or the radius (dogleg), `linear` the iterations of the linear solver; a step that was
     refused has a dash for its change.
     """
-    stream = sys.stdout if stream is None else stream
+    stream = sys.stderr if to_stderr else sys.stdout
     if step.step == 1:
         titles = "".join(f"{title:>{12 if title == 'cost' else 10}}" for title in _TITLES[1:])
         print(f"{_TITLES[0]:>5}{titles}", file=stream)

@@ -44,9 +44,10 @@ class Run:
 def facts(run: Run) -> dict[str, object]:
     """Return everything about a run by name, for `--json`.
 
-    Costs, steps, times and `history` are of the last round, if there was rejection; `seconds_total` is of all rounds.
+    With rejection, costs, steps and `history` are of the last round, `rounds` tells of each; times are of all together.
     """
     solution, report, found = run.found.solution, run.report, run.found.quality
+    reports = [round_.report for round_ in run.found.solutions if round_.report is not None]
     before, after = intrinsics(run.problem), intrinsics(solution.apply(run.problem))
     names = type(run.problem.cameras).parameter_names()
     return {
@@ -56,15 +57,16 @@ def facts(run: Run) -> dict[str, object]:
         "hints": hints(run),
         "initial_cost": float(solution.initial_cost),
         "final_cost": float(solution.final_cost),
-        "plain_cost": float(solution.plain_cost),
+        "initial_plain_cost": float(solution.initial_plain_cost),
+        "final_plain_cost": float(solution.plain_cost),
         "loss": run.options.loss,
         "f_scale": run.options.f_scale,
         "method": run.options.method,
         "linear_solver": report.linear_solver,
         "num_steps": int(solution.num_steps),
-        "seconds_setup": report.seconds_setup,
-        "seconds_compile": report.seconds_compile,
-        "seconds_solve": report.seconds_solve,
+        "seconds_setup": sum(r.seconds_setup for r in reports),
+        "seconds_compile": sum(r.seconds_compile for r in reports),
+        "seconds_solve": sum(r.seconds_solve for r in reports),
         "seconds_total": run.seconds,
         "median_error_px": found.median_px,
         "rms_error_px": found.rms_px,
@@ -77,6 +79,15 @@ def facts(run: Run) -> dict[str, object]:
         "num_observations": run.problem.num_observations,
         "num_used": int(np.count_nonzero(run.found.used)),
         "num_rejected": list(run.found.num_rejected),
+        "rounds": [
+            {
+                "result": round_.result,
+                "initial_cost": float(round_.initial_cost),
+                "final_cost": float(round_.final_cost),
+                "num_steps": int(round_.num_steps),
+            }
+            for round_ in run.found.solutions
+        ],
         "dropped": report.dropped.summary(),
         "free_gauge": list(report.free_gauge),
         "intrinsics": {
@@ -97,7 +108,10 @@ def summary(run: Run) -> str:
     """Return the run in words."""
     solution, report, found = run.found.solution, run.report, run.found.quality
     problem = run.problem
-    plain = "" if isinstance(run.loss, Linear) else f" ({run.options.loss}; {solution.plain_cost:.6g} without the loss)"
+    costs = f"{solution.initial_cost:.6g} -> {solution.final_cost:.6g}"
+    if not isinstance(run.loss, Linear):
+        plain = f"{solution.initial_plain_cost:.6g} -> {solution.plain_cost:.6g}"
+        costs = f"{costs} ({run.options.loss}; without the loss {plain})"
     sizes = (
         many(problem.num_images, "image"),
         many(problem.num_cameras, "camera"),
@@ -111,7 +125,7 @@ def summary(run: Run) -> str:
         (
             ("problem", f"{run.file}: {', '.join(sizes)}"),
             ("result", [solution.advice, *hints(run)]),
-            ("cost", f"{solution.initial_cost:.6g} -> {solution.final_cost:.6g}{plain}"),
+            ("cost", costs),
             ("steps", f"{solution.num_steps} in {report.seconds_solve:.2f} s ({seconds}; {report.linear_solver})"),
             ("left out", report.dropped.summary()),
             ("rejected", rejected),

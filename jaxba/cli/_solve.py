@@ -1,6 +1,7 @@
 """`jaxba solve`: read, adjust, write, tell."""
 
 import contextlib
+import functools
 import math
 import os
 import sys
@@ -11,15 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import HistoryStep, Problem, Rejected, quality, solve, solve_and_reject
+from jaxba.ba import HistoryStep, Problem, Rejected, solve_and_reject
 from jaxba.cli import _progress
 from jaxba.cli._cache import use_compilation_cache
 from jaxba.cli._options import SolveOptions
 from jaxba.cli._result import Run, facts, summary
 from jaxba.cli._text import to_json
 from jaxba.geometry import LOSSES, AbstractLoss, Barron
-from jaxba.io import read_problem, refuse_same_file, write_bal, write_tile
-from jaxba.io._bal import _what_bal_cannot_hold
+from jaxba.io import read_problem, refuse_same_file, what_bal_cannot_hold, write_bal, write_tile
 
 NOT_CONVERGED, INTERRUPTED = 1, 130
 _ROUNDS = 2
@@ -150,7 +150,7 @@ def _check_output(out: Path, given: Problem) -> None:
             "permissions."
         )
     if out.name.endswith(_BAL_ENDINGS):
-        lost = _what_bal_cannot_hold(given)
+        lost = what_bal_cannot_hold(given)
         if lost:
             raise JaxbaError(f"{out}: BAL cannot hold {'; '.join(lost)}. Name a tile (--out NAME.npz) instead.")
 
@@ -160,10 +160,9 @@ def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Reje
     with contextlib.ExitStack() as stack:
         callback: Callable[[HistoryStep], None] | None = None
         if options.verbose:
-            stream = sys.stderr if options.json else sys.stdout
-            callback = lambda step: _progress.print_step(step, stream)  # noqa: E731
+            callback = functools.partial(_progress.print_step, to_stderr=options.json)
         elif sys.stderr.isatty() and not options.quiet:
-            callback = stack.enter_context(_progress.line(sys.stderr))
+            callback = stack.enter_context(_progress.line())
         settings = {
             "loss": loss,
             "method": options.method,
@@ -174,14 +173,9 @@ def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Reje
             "gtol": options.gtol,
             "callback": callback,
         }
-        if options.reject:
-            rounds = _ROUNDS if options.rounds is None else options.rounds
-            return solve_and_reject(problem, rounds=rounds, mad_factor=options.mad_factor, **settings)
-        solution = solve(problem, **settings)
-        report = solution.report
-        assert report is not None
-        used = ~report.dropped.observations
-        return Rejected(solution, used, quality(solution.apply(problem), used, mad_factor=options.mad_factor), ())
+        asked = _ROUNDS if options.rounds is None else options.rounds
+        rounds = asked if options.reject else 0
+        return solve_and_reject(problem, rounds=rounds, mad_factor=options.mad_factor, **settings)
 
 
 def _write(out: Path, given: Problem, problem: Problem, found: Rejected) -> None:

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 from jaxba.io._atomic import refuse_same_file, write_atomically
 
 if TYPE_CHECKING:
-    from jaxba.io._bal import read_bal, write_bal
+    from jaxba.io._bal import read_bal, what_bal_cannot_hold, write_bal
     from jaxba.io._problem import read_problem
     from jaxba.io._schema import SCHEMA, schema_markdown
     from jaxba.io._tile import read_tile, write_tile
 
 __all__ = [
-    "SCHEMA", "read_bal", "read_problem", "read_tile", "refuse_same_file", "schema_markdown", "write_atomically",
-    "write_bal", "write_tile",
+    "SCHEMA", "read_bal", "read_problem", "read_tile", "refuse_same_file", "schema_markdown", "what_bal_cannot_hold",
+    "write_atomically", "write_bal", "write_tile",
 ]  # fmt: skip
 
 _MODULE_OF = {
@@ -26,6 +26,7 @@ _MODULE_OF = {
     "read_problem": "jaxba.io._problem",
     "read_tile": "jaxba.io._tile",
     "schema_markdown": "jaxba.io._schema",
+    "what_bal_cannot_hold": "jaxba.io._bal",
     "write_bal": "jaxba.io._bal",
     "write_tile": "jaxba.io._tile",
 }

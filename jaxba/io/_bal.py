@@ -83,7 +83,7 @@ def write_bal(path: str | os.PathLike[str], problem: Problem) -> None:
     >>> write_bal(folder / "b.txt.bz2", read_bal(folder / "a.txt"))
     """
     label = os.fspath(path)
-    lost = _what_bal_cannot_hold(problem)
+    lost = what_bal_cannot_hold(problem)
     if lost:
         raise JaxbaError(f"{label}: BAL cannot hold {'; '.join(lost)}. Write a tile.npz instead (jaxba.write_tile).")
     observations, cameras = problem.observations, problem.cameras
@@ -198,7 +198,7 @@ def _bal_angle_axis(quaternion: np.ndarray) -> np.ndarray:
     return np.where(norm > 0, 2 * np.arctan2(norm, np.abs(w)) / nonzero, 2.0)[:, None] * vector
 
 
-def _what_bal_cannot_hold(problem: Problem) -> list[str]:
+def what_bal_cannot_hold(problem: Problem) -> list[str]:
     """Name every part of the problem that would be lost."""
     lost = []
     if not isinstance(problem.cameras, BAL):

@@ -1,7 +1,7 @@
 """The optimum equals scipy's, on small problems of every camera model, loss, bound and prior.
 
 scipy sees square-rooted residuals of the dense reference, whose plain squares sum to the robust cost: a loss belongs to
-an observation's two components together. It starts beside the solver's optimum (a tenth of a sigma off in every
+an observation's two components together. It starts beside the solver's optimum (some hundredths of a sigma off in every
 unknown), so that both are in one basin where a loss is not convex.
 """
 
@@ -40,7 +40,7 @@ def assert_scipy_agrees(dense: Dense, found: Minimum, *, from_start: bool = Fals
     vector, reached = dense.tangent(found.unknowns), float(found.state.cost)
     np.testing.assert_allclose(dense.cost(vector), reached, rtol=1e-12)
     sigma = 1 / np.linalg.norm(dense.square_rooted_jacobian(vector), axis=0)
-    beside = vector + 0.1 * sigma * np.random.default_rng(0).normal(size=dense.size)
+    beside = vector + 0.03 * sigma * np.random.default_rng(0).normal(size=dense.size)
     starts = [np.clip(beside, dense.lower, dense.upper), *([np.zeros(dense.size)] if from_start else [])]
     for start in starts:
         # 1e-8: scipy's Gauss-Newton creeps under strong losses, and stops that far above

@@ -144,33 +144,35 @@ def _panels(system: System, reduced: Reduced) -> Float[Array, "panels panel band
     shape = system.shape
     group, width = shape.panel_images, shape.band_panels + 1
     num_panels = shape.num_images // group
-    band = jnp.zeros((num_panels, group, width, group, shape.block, shape.block), reduced.diagonal.dtype)
+    size = shape.block
+    band = jnp.zeros((num_panels, group, size, width, group, size), reduced.diagonal.dtype)
     images = jnp.arange(shape.num_images)
-    band = band.at[images // group, images % group, width - 1, images % group].set(reduced.diagonal)
-    row, column = system.block_row, system.block_column
+    own = images // group, images % group
+    band = band.at[*own, :, width - 1, images % group, :].set(reduced.diagonal)
+    row, column = jnp.asarray(system.block_row), jnp.asarray(system.block_column)
     offset = column // group - row // group + width - 1
-    band = band.at[row // group, row % group, offset, column % group].add(reduced.off_diagonal)
-    return jnp.transpose(band, (0, 1, 4, 2, 3, 5)).reshape(num_panels, group * shape.block, -1)
+    band = band.at[row // group, row % group, :, offset, column % group, :].add(reduced.off_diagonal)
+    return band.reshape(num_panels, group * size, width * group * size)
 
 
 def _factor_banded(panels: Float[Array, "panels panel band"]) -> tuple[Array, Array]:
     """Right-looking band Cholesky; the carry is the window of the band below the panel in hand."""
     num_panels, size, band = panels.shape
     below = band - size
-    # the scan takes in the row panel that enters the window when a panel leaves it
-    entering = jnp.concatenate([panels[band // size :], jnp.zeros((band // size, size, band), panels.dtype)])
+    width = band // size
     window = jnp.zeros((band, band), panels.dtype)
-    for i in range(band // size):  # panel i of the first window: its last (i + 1) blocks of columns
-        rows = panels[i] if i < num_panels else jnp.zeros((size, band), panels.dtype)
-        window = window.at[i * size : (i + 1) * size, : (i + 1) * size].set(rows[:, band - (i + 1) * size :])
+    for i in range(min(width, num_panels)):  # panel i of the first window: its last (i + 1) blocks of columns
+        window = window.at[i * size : (i + 1) * size, : (i + 1) * size].set(panels[i][:, band - (i + 1) * size :])
 
-    def factor(window: Array, rows: Array) -> tuple[Array, tuple[Array, Array]]:
+    def factor(window: Array, panel: Array) -> tuple[Array, tuple[Array, Array]]:
         root = lax.linalg.cholesky(window[:size, :size], symmetrize_input=False)
-        panel = lax.linalg.triangular_solve(root, window[size:, :size], left_side=False, lower=True, transpose_a=True)
-        moved = jnp.pad(window[size:, size:] - panel @ panel.T, ((0, size), (0, size)))
-        return lax.dynamic_update_slice(moved, rows, (below, 0)), (root, panel)
+        under = lax.linalg.triangular_solve(root, window[size:, :size], left_side=False, lower=True, transpose_a=True)
+        moved = jnp.pad(window[size:, size:] - under @ under.T, ((0, size), (0, size)))
+        # the panel of rows that enters the window as this one leaves it
+        enters = jnp.where(panel + width < num_panels, panels[jnp.minimum(panel + width, num_panels - 1)], 0.0)
+        return lax.dynamic_update_slice(moved, enters, (below, 0)), (root, under)
 
-    return lax.scan(factor, window, entering[:num_panels])[1]
+    return lax.scan(factor, window, jnp.arange(num_panels))[1]
 
 
 def _solve_banded(factor: tuple[Array, ...], rhs: Float[Array, "n columns"]) -> Float[Array, "n columns"]:

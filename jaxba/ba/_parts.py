@@ -91,11 +91,12 @@ def _extents(
     """Return mean and rms extent of each part, without what lies far from the rest: one point may be a world away."""
     middle, size = np.zeros((count, 3)), np.full(count, np.inf)
     for _ in range(_TRIMMING_ROUNDS):
-        distance = np.linalg.norm(xyz - middle[part], axis=1)
-        near = distance <= _FAR * size[part]
-        middle = mean_by(xyz[near], part[near], count)
-        squared = np.sum((xyz[near] - middle[part[near]]) ** 2, axis=1, keepdims=True)
-        size = np.sqrt(mean_by(squared, part[near], count))[:, 0]
+        near = np.sum((xyz - middle[part]) ** 2, axis=1) <= (_FAR * size[part]) ** 2
+        if near.all() and np.isfinite(size).all():
+            break
+        xyz, part = xyz[near], part[near]
+        middle = mean_by(xyz, part, count)
+        size = np.sqrt(mean_by(np.sum((xyz - middle[part]) ** 2, axis=1, keepdims=True), part, count))[:, 0]
     return middle, size
 
 

@@ -1,6 +1,7 @@
 """What `solve` returns: the adjusted unknowns, how the solver got there and what it left out."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -9,6 +10,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._check import Dropped
+from jaxba.ba._gauge import free_gauge
 from jaxba.ba._problem import Problem
 from jaxba.ba._rows import Unknowns
 from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
@@ -56,25 +58,30 @@ class HistoryStep:
     linear_iterations: int = 0
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Report:
     """What a solve on the host tells beside its numbers.
 
     - `history`: the start and every step tried.
     - `dropped`: what was left out of the problem, with reasons; `dropped.summary()` says it in words.
-    - `free_gauge`: directions that nothing fixes; empty if the problem is fully determined.
     - `seconds_setup`: checks and structure; `seconds_compile`; `seconds_solve`: the steps.
     - `linear_solver`: how the reduced system was solved.
     """
 
     history: tuple[HistoryStep, ...]
     dropped: Dropped
-    free_gauge: tuple[str, ...]
     seconds_setup: float
     seconds_compile: float
     seconds_solve: float
     linear_solver: str
     interrupted: bool
+    problem: Problem
+    """What was solved: the given problem without what was left out."""
+
+    @functools.cached_property
+    def free_gauge(self) -> tuple[str, ...]:
+        """Directions that nothing fixes; empty if the problem is fully determined."""
+        return free_gauge(self.problem)
 
 
 class Solution(eqx.Module):

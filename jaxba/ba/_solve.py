@@ -6,11 +6,11 @@ derivative) the same solver runs in `optimistix.least_squares`; the structure mu
 made with `make_plan`.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from jaxba._errors import JaxbaError
 from jaxba.ba._check import prepare
 from jaxba.ba._compiled import compiled
-from jaxba.ba._gauge import free_gauge
 from jaxba.ba._linearise import cost
 from jaxba.ba._plan import LinearSolver, Plan, make_plan
 from jaxba.ba._problem import Problem
@@ -98,11 +97,10 @@ def _solve_on_host(
 ) -> Solution:
     begin = time.perf_counter()
     prepared = prepare(problem)
-    gauge = free_gauge(prepared.problem)
     if plan is None or prepared.dropped.any():
         plan = make_plan(prepared.problem, linear_solver=linear_solver)
     system: System = jax.device_put(make_system(prepared.problem, plan, loss, dtype))
-    plain: System = jax.device_put(make_system(_without_losses(prepared.problem), plan, Linear(), dtype))
+    plain: System = jax.device_put(_without_losses(system))
     unknowns: Unknowns = jax.device_put(initial_unknowns(prepared.problem, plan, dtype))
     ready = time.perf_counter()
     run = compiled(solver, unknowns, system, plain)
@@ -124,12 +122,12 @@ def _solve_on_host(
     report = Report(
         history=tuple(history),
         dropped=prepared.dropped,
-        free_gauge=gauge,
         seconds_setup=ready - begin,
         seconds_compile=started - ready,
         seconds_solve=time.perf_counter() - started,
         linear_solver=plan.shape.linear_solver,
         interrupted=interrupted,
+        problem=prepared.problem,
     )
     values = restore(to_host(unknowns), prepared.problem, plan)
     return Solution(
@@ -166,7 +164,7 @@ def _solve_traced(
 ) -> Solution:
     dtype = jnp.result_type(float)
     system = make_system(problem, plan, loss, dtype)
-    plain = make_system(_without_losses(problem), plan, Linear(), dtype)
+    plain = _without_losses(system)
     start = initial_unknowns(problem, plan, dtype)
     found = optx.least_squares(residuals, solver, start, args=system, max_steps=max_nfev, throw=False)
     values = restore(found.value, problem, plan)
@@ -184,6 +182,6 @@ def _solve_traced(
     )
 
 
-def _without_losses(problem: Problem) -> Problem:
-    priors = tuple(eqx.tree_at(lambda p: p.loss, prior, Linear()) for prior in problem.priors)
-    return eqx.tree_at(lambda p: p.priors, problem, priors, is_leaf=lambda x: x is problem.priors)
+def _without_losses(system: System) -> System:
+    linear = tuple(dataclasses.replace(prior, loss=Linear()) for prior in system.priors)
+    return dataclasses.replace(system, loss=Linear(), priors=linear)

@@ -30,6 +30,10 @@ from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, re
 from jaxba.ba._system import System
 
 _MIN_RATIO = 1e-3
+# Where the model foretells a decrease this exactly, damping may fall much faster than by Ceres's third: 100 images are
+# within 0.1% of the optimum after 2 steps instead of 3 and at it after 4 instead of 7. Looser is worse on BAL's
+# problems.
+_EXACT, _EXACT_SHRINK = 0.02, 0.03
 _BEND, _BEND_BELOW = 0.5, 0.1  # use half a robust loss's curvature once steps change the cost by less than a tenth
 _MIN_DIAGONAL = 1e-12  # of the largest entry of its kind
 _MAX_DAMPING = 1e16
@@ -200,6 +204,7 @@ class SchurLevenbergMarquardt(AbstractSchurSolver):
         del scaled_norm
         good = ratio > _MIN_RATIO
         shrink = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
+        shrink = jnp.where(jnp.abs(ratio - 1) < _EXACT, _EXACT_SHRINK, shrink)
         trust = jnp.where(good, state.trust * shrink, state.trust * state.factor)
         return jnp.maximum(trust, 1e-16), jnp.where(good, 2.0, state.factor * 2)
 

@@ -1,0 +1,129 @@
+"""`solve` as users call it: published costs, Ceres, jit and vmap, interruption, what is left out."""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import jaxba
+from jaxba.ba import HistoryStep
+
+SMALL = jaxba.synthetic.uav_block(8, seed=5)
+
+
+@pytest.mark.parametrize(("name", "most"), [("49-7776", 13345.0), ("21-11315", 30379.0)])
+def test_cost_of_a_published_problem_is_reached(data_dir: Path, name: str, most: float) -> None:
+    problem = jaxba.read_bal(data_dir / f"bal/problem-{name}-pre.txt")
+    solution = jaxba.solve(problem)
+    assert solution.converged
+    assert solution.final_cost <= most
+    assert len(solution.report.free_gauge) == 7
+
+
+def test_robust_cost_is_that_of_ceres(data_dir: Path) -> None:
+    pytest.importorskip("pyceres", reason="pyceres has no wheel for this machine")
+    from benchmarks.peers.ceres import solve_with_ceres
+
+    problem = jaxba.read_bal(data_dir / "bal/problem-21-11315-pre.txt")
+    loss = jaxba.Huber(1.0)
+    ceres = solve_with_ceres(problem, loss, max_num_iterations=100)
+    solution = jaxba.solve(problem, loss=loss)
+    # the promise is to be as good within 0.1%; lower is welcome
+    assert solution.final_cost <= 1.001 * ceres.final_cost
+
+
+@pytest.mark.parametrize("method", ["lm", "dogleg"])
+def test_solve_inside_jit_equals_the_host_loop(method: str) -> None:
+    host = jaxba.solve(SMALL.problem, method=method, loss=jaxba.Huber(1.0))
+    plan = jaxba.make_plan(SMALL.problem)
+
+    @eqx.filter_jit
+    def final(problem: jaxba.Problem) -> jaxba.Solution:
+        return jaxba.solve(problem, method=method, loss=jaxba.Huber(1.0), plan=plan)
+
+    traced = final(_on_device(SMALL.problem))
+    assert int(traced.num_steps) == int(host.num_steps)
+    np.testing.assert_allclose(traced.final_cost, host.final_cost, rtol=1e-12)
+    np.testing.assert_allclose(traced.points, host.points, rtol=0, atol=1e-6)  # metres; rounding along weak directions
+
+
+def test_vmap_over_pixels_equals_one_solve_each() -> None:
+    plan = jaxba.make_plan(SMALL.problem)
+    problem = _on_device(SMALL.problem)
+    noise = 0.1 * np.random.default_rng(0).normal(size=(3, *problem.observations.xy_px.shape))
+
+    def final_cost(noise: jax.Array) -> jax.Array:
+        moved = eqx.tree_at(lambda p: p.observations.xy_px, problem, problem.observations.xy_px + noise)
+        return jaxba.solve(moved, plan=plan, max_nfev=30).final_cost
+
+    together = jax.jit(jax.vmap(final_cost))(noise)
+    alone = [
+        jaxba.solve(
+            eqx.tree_at(lambda p: p.observations.xy_px, SMALL.problem, SMALL.problem.observations.xy_px + n)
+        ).final_cost
+        for n in noise
+    ]
+    np.testing.assert_allclose(together, np.stack(alone), rtol=1e-9)
+
+
+def test_traced_values_without_a_plan_are_refused_with_the_cure() -> None:
+    with pytest.raises(jaxba.JaxbaError, match="plan=jaxba.make_plan"):
+        jax.jit(lambda p: jaxba.solve(p).final_cost)(_on_device(SMALL.problem))
+
+
+def test_interrupt_keeps_what_was_reached() -> None:
+    def stop(step: HistoryStep) -> None:
+        if step.step == 2:
+            raise KeyboardInterrupt
+
+    solution = jaxba.solve(SMALL.problem, callback=stop)
+    assert solution.result == "interrupted"
+    assert int(solution.num_steps) == 2
+    assert solution.final_cost == solution.report.history[-1].cost < solution.initial_cost
+
+
+def test_evaluation_limit_is_not_convergence() -> None:
+    solution = jaxba.solve(SMALL.problem, max_nfev=1)
+    assert solution.result == "max_nfev"
+    assert not solution.converged
+
+
+def test_point_behind_the_camera_is_left_out_and_named() -> None:
+    points = SMALL.problem.points.copy()
+    points[3, 2] = 1e4  # far above the flight
+    problem = eqx.tree_at(lambda p: p.points, SMALL.problem, points)
+    solution = jaxba.solve(problem)
+    assert solution.converged
+    assert "behind the camera" in " ".join(solution.report.dropped.summary())
+    np.testing.assert_array_equal(solution.points[3], points[3])
+
+
+def test_second_solve_gives_the_same_bytes() -> None:
+    first, second = (jaxba.solve(SMALL.problem, loss=jaxba.Cauchy(2.0)) for _ in range(2))
+    assert first.points.tobytes() == second.points.tobytes()
+    assert first.poses.quaternion.tobytes() == second.poses.quaternion.tobytes()
+
+
+def test_rejection_leaves_out_gross_errors_and_little_else() -> None:
+    survey = jaxba.synthetic.uav_block(12, seed=2, outlier_fraction=0.05)
+    cleaned = jaxba.solve_and_reject(survey.problem, rounds=2, loss=jaxba.Huber(1.0))
+    outlier = survey.truth.is_outlier
+    assert np.mean(cleaned.used[outlier]) < 0.1
+    # a Rayleigh distribution has 7% beyond median + 2.5 MAD, and each round cuts a little more
+    assert np.mean(cleaned.used[~outlier]) > 0.8
+    assert len(cleaned.solutions) == 3
+
+
+def test_float32_comes_near_the_double_precision_cost() -> None:
+    single = jaxba.solve(SMALL.problem, dtype=np.float32, ftol=1e-6)
+    double = jaxba.solve(SMALL.problem)
+    assert single.points.dtype == np.float32
+    # pixels of 4000 have steps of 2e-4 in float32, beside a noise of 0.5
+    np.testing.assert_allclose(single.final_cost, double.final_cost, rtol=1e-2)
+
+
+def _on_device(problem: jaxba.Problem) -> jaxba.Problem:
+    floats, rest = eqx.partition(problem, lambda a: isinstance(a, np.ndarray) and a.dtype.kind == "f")
+    return eqx.combine(jax.tree.map(jax.numpy.asarray, floats), rest)

@@ -1,6 +1,7 @@
 """Every test runs in float64, with the shapes and types of each annotated function and class checked at run time."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -18,3 +19,15 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"needs real data, and {path} is no folder; set JAXBA_DATA to it")
     return path
+
+
+_LARGE = {"test_solve", "test_recovery", "test_cli"}  # run real sizes, which optimised code pays for
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _quick_compilation(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Leave out XLA's costly optimisations where dozens of tiny programs are compiled: half the time."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", request.path.stem not in _LARGE)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)

@@ -86,6 +86,8 @@ class Plan(eqx.Module):
     image_order: Int[np.ndarray, " images"]
     """Original index of each image, in solver order (without padding)."""
     point_order: Int[np.ndarray, " points"]
+    camera_order: Int[np.ndarray, " cameras"]
+    """Original index of each camera in solver order: that of the images where each has its own."""
     row_observation: Int[np.ndarray, " rows"]
     """Original index of the observation in each row, -1 for padding."""
     row_image: Int[np.ndarray, " rows"]
@@ -156,6 +158,7 @@ def make_plan(problem: Problem, *, linear_solver: LinearSolver = "auto") -> Plan
     return Plan(
         image_order=image_order,
         point_order=point_order,
+        camera_order=np.asarray(problem.camera_index)[image_order] if own_cameras else np.arange(problem.num_cameras),
         row_observation=row_observation,
         row_image=row_image,
         row_point=row_point,

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxba.ba._linearise import point_costs, point_equations
 from jaxba.ba._rows import Unknowns
@@ -27,8 +27,10 @@ _NEAR_BEND = 0.9
 _SWEEPS, _ROBUST_SWEEPS = 2, 6
 
 
-def refine_points(system: System, trial: Unknowns, before: Unknowns, near: Bool[Array, ""]) -> Unknowns:
-    """Return `trial` with its points refined.
+def refine_points(
+    system: System, trial: Unknowns, before: Unknowns, near: Bool[Array, ""]
+) -> tuple[Unknowns, Int[Array, ""]]:
+    """Return `trial` with its points refined, and how many of them had to go back first.
 
     - `before`: a point that the step has put behind a camera, or where its cost is not finite, first goes back there.
     - `near`: whether steps have become small.
@@ -51,7 +53,8 @@ def refine_points(system: System, trial: Unknowns, before: Unknowns, near: Bool[
         return (_with_points(unknowns, points), jnp.where(better, moved_costs, costs), damping), None
 
     start = (trial, costs, jnp.full(costs.shape, 1e-4, costs.dtype))
-    return jax.lax.scan(sweep, start, length=_SWEEPS if isinstance(system.loss, Linear) else _ROBUST_SWEEPS)[0][0]
+    refined = jax.lax.scan(sweep, start, length=_SWEEPS if isinstance(system.loss, Linear) else _ROBUST_SWEEPS)[0][0]
+    return refined, jnp.sum(lost)
 
 
 def _with_points(unknowns: Unknowns, points: Float[Array | np.ndarray, "points 3"]) -> Unknowns:

@@ -45,6 +45,7 @@ class HistoryStep:
 
     - `change`: by which the cost fell. `gradient`: largest entry of the gradient before the step. `step`: its length.
     - `trust`: damping (Levenberg-Marquardt) or radius (dogleg) for the next step.
+    - `points_held`: points that the step would have put behind a camera or nowhere; they stayed where they were.
     """
 
     step: int
@@ -56,6 +57,7 @@ class HistoryStep:
     step_norm: float = 0.0
     trust: float = 0.0
     linear_iterations: int = 0
+    points_held: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

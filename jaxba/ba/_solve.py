@@ -156,6 +156,7 @@ def _history_step(step: int, started: float, state: State) -> HistoryStep:
         step_norm=float(state.step_norm),
         trust=float(state.trust),
         linear_iterations=int(state.linear_iterations),
+        points_held=int(state.points_held),
     )
 
 

@@ -53,6 +53,7 @@ class State(eqx.Module):
     gradient_norm: Float[Array, ""]
     step_norm: Float[Array, ""]
     linear_iterations: Int[Array, ""]
+    points_held: Int[Array, ""]
     accepted: Bool[Array, ""]
     status: Int[Array, ""]
     num_steps: Int[Array, ""]
@@ -114,6 +115,7 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
             gradient_norm=zero + jnp.inf,
             step_norm=zero + jnp.inf,
             linear_iterations=jnp.array(0),
+            points_held=jnp.array(0),
             accepted=jnp.array(True),
             status=jnp.where(jnp.isfinite(start), RUNNING, NOT_FINITE),
             num_steps=jnp.array(0),
@@ -129,7 +131,7 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
         step, linear_iterations = self.propose(system, y, model, state.trust)
         step = _within_bounds(system, y, step)
         promised = -_slope(model.gradient, step) - curvature(system, model, step) / 2
-        trial = refine_points(system, y.retract(step), y, state.bend > 0)
+        trial, points_held = refine_points(system, y.retract(step), y, state.bend > 0)
         trial_cost = cost(system, trial)
         finite = jnp.isfinite(promised) & jnp.isfinite(trial_cost)
         change = jnp.where(finite, state.cost - trial_cost, -jnp.inf)
@@ -155,6 +157,7 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
             gradient_norm=gradient_norm,
             step_norm=step_norm,
             linear_iterations=linear_iterations,
+            points_held=points_held,
             accepted=accepted,
             status=status,
             num_steps=state.num_steps + 1,

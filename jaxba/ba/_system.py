@@ -51,7 +51,7 @@ def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = n
     seen = plan.row_observation >= 0
     source = np.where(seen, plan.row_observation, 0)
     weight = xp.where(seen, 1 / xp.asarray(observations.std_px, dtype)[source], 0.0)
-    camera_of_image = _camera_of_image(problem, plan)
+    camera_of_image = _camera_of_image(xp, problem, plan)
     runs = (-1, ROW_RUN)
     reprojection = Reprojection(
         xy_px=xp.asarray(observations.xy_px, dtype)[source].T.reshape(2, *runs),
@@ -62,11 +62,10 @@ def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = n
         model=type(problem.cameras),
         refined=shape.refined,
     )
-    cameras = _cameras_in_order(plan, problem.num_cameras, np.asarray(problem.camera_index))
     free = Step(
         poses=_padded(xp, problem.free.poses, plan.image_order, shape.num_images, 0.0, dtype)[:, None]
         * xp.ones((1, 6), dtype),
-        intrinsics=_padded(xp, problem.free.intrinsics, cameras, shape.num_cameras, 0.0, dtype),
+        intrinsics=_padded(xp, problem.free.intrinsics, plan.camera_order, shape.num_cameras, 0.0, dtype),
         lever_arm=xp.asarray(problem.free.lever_arm, dtype) * xp.ones(3, dtype),
         points=_padded(xp, problem.free.points, plan.point_order, shape.num_points, 0.0, dtype)[:, None]
         * xp.ones((1, 3), dtype),
@@ -74,10 +73,10 @@ def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = n
     return System(
         reprojection=reprojection,
         loss=_as_arrays(xp, loss, dtype),
-        priors=tuple(_reordered(xp, prior, problem, plan, cameras, dtype) for prior in problem.priors),
+        priors=tuple(_reordered(xp, prior, plan, dtype) for prior in problem.priors),
         free=free,
-        lower=_padded(xp, problem.lower, cameras, shape.num_cameras, -np.inf, dtype),
-        upper=_padded(xp, problem.upper, cameras, shape.num_cameras, np.inf, dtype),
+        lower=_padded(xp, problem.lower, plan.camera_order, shape.num_cameras, -np.inf, dtype),
+        upper=_padded(xp, problem.upper, plan.camera_order, shape.num_cameras, np.inf, dtype),
         pair_first=plan.pair_first,
         pair_second=plan.pair_second,
         pair_block=plan.pair_block,
@@ -97,13 +96,12 @@ def initial_unknowns(problem: Problem, plan: Plan, dtype: Any = np.float64) -> U
     )
     names = type(problem.cameras).parameter_names()
     parameters = xp.stack([xp.asarray(getattr(problem.cameras, name), dtype) for name in names], axis=-1)
-    cameras = _cameras_in_order(plan, problem.num_cameras, np.asarray(problem.camera_index))
     return Unknowns(
         poses=Pose(
             xp.asarray(quaternion, dtype),
             _padded(xp, problem.poses.translation, plan.image_order, shape.num_images, 0.0, dtype),
         ),
-        intrinsics=_padded(xp, parameters, cameras, shape.num_cameras, None, dtype),
+        intrinsics=_padded(xp, parameters, plan.camera_order, shape.num_cameras, None, dtype),
         lever_arm=xp.asarray(problem.lever_arm, dtype),
         points=_padded(xp, problem.points, plan.point_order, shape.num_points, 1.0, dtype),
     )
@@ -113,8 +111,7 @@ def restore(unknowns: Unknowns, problem: Problem, plan: Plan) -> Unknowns:
     """Return the unknowns in the problem's own order, without padding."""
     xp = _namespace(unknowns)
     image_rank, point_rank = np.argsort(plan.image_order), np.argsort(plan.point_order)
-    cameras = _cameras_in_order(plan, problem.num_cameras, np.asarray(problem.camera_index))
-    camera_rank = np.argsort(cameras)
+    camera_rank = np.argsort(plan.camera_order)
     return Unknowns(
         poses=Pose(
             xp.asarray(unknowns.poses.quaternion)[image_rank], xp.asarray(unknowns.poses.translation)[image_rank]
@@ -146,17 +143,10 @@ def _identity(count: int) -> Float[np.ndarray, "count 4"]:
     return quaternion
 
 
-def _cameras_in_order(plan: Plan, num_cameras: int, camera_index: np.ndarray) -> Int[np.ndarray, " cameras"]:
-    """Original index of each camera in the solver's order: that of the images where each has its own."""
-    return camera_index[plan.image_order] if plan.shape.own_cameras else np.arange(num_cameras)
-
-
-def _camera_of_image(problem: Problem, plan: Plan) -> Int[np.ndarray, " images"]:
+def _camera_of_image(xp: Any, problem: Problem, plan: Plan) -> Any:
     if plan.shape.own_cameras:
         return np.arange(plan.shape.num_images, dtype=np.int32)
-    camera = np.zeros(plan.shape.num_images, np.int32)
-    camera[: len(plan.image_order)] = np.asarray(problem.camera_index)[plan.image_order]
-    return camera
+    return _padded(xp, problem.camera_index, plan.image_order, plan.shape.num_images, 0.0, np.int32)
 
 
 def _padded(xp: Any, values: Any, order: np.ndarray, count: int, fill: float | None, dtype: Any) -> Any:
@@ -168,14 +158,12 @@ def _padded(xp: Any, values: Any, order: np.ndarray, count: int, fill: float | N
     return xp.concatenate([ordered, tail]) if missing else ordered
 
 
-def _reordered(
-    xp: Any, prior: AbstractPrior, problem: Problem, plan: Plan, cameras: np.ndarray, dtype: Any
-) -> AbstractPrior:
+def _reordered(xp: Any, prior: AbstractPrior, plan: Plan, dtype: Any) -> AbstractPrior:
     """Return a prior with its indices in the solver's order, padded to a bucket with rows of infinite sigma."""
     ranks = {
         "image_index": np.argsort(plan.image_order),
         "point_index": np.argsort(plan.point_order),
-        "camera_index": np.argsort(cameras),
+        "camera_index": np.argsort(plan.camera_order),
     }
     changed: dict[str, Any] = {}
     for field in dataclasses.fields(prior):
@@ -183,12 +171,10 @@ def _reordered(
         if field.name == "loss":
             changed["loss"] = _as_arrays(xp, value, dtype)
             continue
-        if field.name in ranks:
-            value = ranks[field.name][np.asarray(value)].astype(np.int32)
-        else:
-            value = xp.asarray(value, dtype)
+        indexed = field.name in ranks
+        value = xp.asarray(ranks[field.name], np.int32)[value] if indexed else xp.asarray(value, dtype)
         count = value.shape[0]
         fill = np.inf if field.name.startswith("std") else None
-        of = np.int32 if field.name in ranks else dtype
+        of = np.int32 if indexed else dtype
         changed[field.name] = _padded(xp, value, np.arange(count), bucket(count), fill, of)
     return dataclasses.replace(prior, **changed)

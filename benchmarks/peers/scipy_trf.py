@@ -164,42 +164,62 @@ def _evaluator(
     problem: Problem, loss: AbstractLoss, unknowns_of: Callable[[np.ndarray], Unknowns], free: np.ndarray
 ) -> Callable[[np.ndarray], tuple[np.ndarray, csr_array]]:
     observations = problem.observations
-    reprojection = Reprojection(
-        xy_px=jnp.asarray(observations.xy_px).T,
-        weight=1 / jnp.asarray(observations.std_px),
-        image_index=jnp.asarray(observations.image_index),
-        point_index=jnp.asarray(observations.point_index),
+    image, point = np.asarray(observations.image_index), np.asarray(observations.point_index)
+    reprojection = Reprojection(  # runs of one lane: a run an observation
+        xy_px=jnp.asarray(observations.xy_px).T[:, :, None],
+        weight=1 / jnp.asarray(observations.std_px)[:, None],
+        point_index=jnp.asarray(point)[:, None],
+        run_image=jnp.asarray(image),
         camera_index=jnp.asarray(problem.camera_index),
         model=type(problem.cameras),
         refined=tuple(bool(column.any()) for column in np.asarray(problem.free.intrinsics).T),
     )
-    groups = [(loss, eqx.filter_jit(reprojection.rows))]
-    groups += [(prior.loss, eqx.filter_jit(prior.rows)) for prior in problem.priors]
+    pixel_rows = eqx.filter_jit(reprojection.rows)
+    priors = [(prior.loss, eqx.filter_jit(prior.rows)) for prior in problem.priors]
     start_quaternion = jnp.asarray(problem.poses.quaternion)
     num_parameters = problem.lower.shape[1]
+    refined = np.flatnonzero(reprojection.refined)
     first = np.cumsum([0, 6 * problem.num_images, problem.lower.size, 3])
     width = first[3] + 3 * problem.num_points
+    camera = np.asarray(problem.camera_index)[image]
+
+    def place(start: int, stride: int, index: np.ndarray, within: np.ndarray) -> np.ndarray:
+        return start + stride * np.asarray(index)[:, None] + within
+
+    def pixels(unknowns: Unknowns, chain: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+        rows = np.asarray(pixel_rows(unknowns))[..., 0].swapaxes(0, 1)  # (2, rows, columns)
+        pose, intrinsics, residual, by_point = np.split(rows, [6, 6 + len(refined), 7 + len(refined)], axis=2)
+        columns = [
+            place(first[0], 6, image, np.arange(6)),
+            place(first[1], num_parameters, camera, refined),
+            place(first[3], 3, point, np.arange(3)),
+        ]
+        return residual[..., 0], columns, [np.einsum("cni,nij->cnj", pose, chain[image]), intrinsics, by_point]
+
+    def of_prior(rows: Any, chain: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+        columns, blocks = [], []
+        if rows.pose is not None:
+            columns.append(place(first[0], 6, rows.pose.index, np.arange(6)))
+            blocks.append(np.einsum("cin,nij->cnj", rows.pose.jacobian, chain[rows.pose.index]))
+        if rows.intrinsics is not None:
+            columns.append(place(first[1], num_parameters, rows.intrinsics.index, np.arange(num_parameters)))
+            blocks.append(np.swapaxes(rows.intrinsics.jacobian, 1, 2))
+        if rows.lever_arm is not None:
+            columns.append(np.broadcast_to(first[2] + np.arange(3), (rows.residual.shape[1], 3)))
+            blocks.append(np.swapaxes(rows.lever_arm, 1, 2))
+        if rows.point is not None:
+            columns.append(place(first[3], 3, rows.point.index, np.arange(3)))
+            blocks.append(np.swapaxes(rows.point.jacobian, 1, 2))
+        return rows.residual, columns, blocks
 
     def evaluate(x: np.ndarray) -> tuple[np.ndarray, csr_array]:
         unknowns = unknowns_of(x)
         chain = np.asarray(_chain(unknowns, start_quaternion))
+        groups = [(loss, pixels(unknowns, chain))]
+        groups += [(of, of_prior(jax.tree.map(np.asarray, rows(unknowns)), chain)) for of, rows in priors]
         residuals, jacobians = [], []
-        for group_loss, rows_of in groups:
-            rows: Any = jax.tree.map(np.asarray, rows_of(unknowns))  # Rows, in numpy
-            columns, blocks = [], []
-            if rows.pose is not None:
-                columns.append(first[0] + 6 * rows.pose_index[:, None] + np.arange(6))
-                blocks.append(np.einsum("cin,nij->cnj", rows.pose, chain[rows.pose_index]))
-            if rows.intrinsics is not None:
-                columns.append(first[1] + num_parameters * rows.camera_index[:, None] + np.arange(num_parameters))
-                blocks.append(np.swapaxes(rows.intrinsics, 1, 2))
-            if rows.lever_arm is not None:
-                columns.append(np.broadcast_to(first[2] + np.arange(3), (rows.residual.shape[1], 3)))
-                blocks.append(np.swapaxes(rows.lever_arm, 1, 2))
-            if rows.point is not None:
-                columns.append(first[3] + 3 * rows.point_index[:, None] + np.arange(3))
-                blocks.append(np.swapaxes(rows.point, 1, 2))
-            r, jacobian = _with_loss(group_loss, rows.residual, np.concatenate(blocks, axis=2))
+        for group_loss, (residual, columns, blocks) in groups:
+            r, jacobian = _with_loss(group_loss, residual, np.concatenate(blocks, axis=2))
             column = np.broadcast_to(np.concatenate(columns, axis=1), jacobian.shape)
             row_end = np.arange(r.size + 1) * jacobian.shape[2]
             residuals.append(r.ravel())

@@ -230,15 +230,15 @@ def _choose_linear_solver(
 ) -> tuple[Literal["dense", "banded", "cg"], int, int]:
     """Return the way to solve the reduced system, the images a panel and the panels in the band.
 
-    Panels of 48 to 96 unknowns measured best. Banded costs 2 n b^2 flops, dense n^3/3 but in one call to LAPACK.
+    Panels of 48 to 96 unknowns measured best. Banded costs 2 n b^2 flops for half-bandwidth b, dense n^3/3 in one call
+    to LAPACK, which wins up to some 900 unknowns (`benchmarks/linear_solvers.py`) and where the band is nearly full.
     """
     panel_images = max(1, round(48 / block))
     band_panels = max(1, -(-bandwidth // panel_images))
     unknowns, band = num_images * block, (band_panels + 1) * panel_images * block
     if asked == "auto":
-        dense_cost = unknowns**3 / 3
-        banded_cost = 2 * unknowns * band**2 + unknowns * 2e5
-        asked = "dense" if unknowns <= 1500 and dense_cost <= 2 * banded_cost else "banded"
+        full = band > 0.4 * unknowns and unknowns <= _DENSE_MOST
+        asked = "dense" if unknowns <= _DENSE_ALWAYS or full else "banded"
         if asked == "banded" and 8.0 * unknowns * band > _BAND_BYTES:
             asked = "cg"
     if asked != "banded":
@@ -246,6 +246,7 @@ def _choose_linear_solver(
     return "banded", panel_images, bucket(band_panels)
 
 
+_DENSE_ALWAYS, _DENSE_MOST = 900, 6000
 _BAND_BYTES = 2e9
 
 

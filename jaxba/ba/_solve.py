@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +35,13 @@ _SOLVERS: dict[str, type[SchurLevenbergMarquardt] | type[SchurDogleg]] = {
     "lm": SchurLevenbergMarquardt,
     "dogleg": SchurDogleg,
 }
+
+# optimistix's implicit adjoint would invert a Hessian that the length of each quaternion makes singular: no gradient is
+# better than a wrong one
+_NO_DERIVATIVE = (
+    "jaxba.solve cannot be differentiated yet. Use jaxba.covariance for the effect of measurement errors, or "
+    "finite differences of solves."
+)
 
 
 def solve(
@@ -163,6 +171,7 @@ def _history_step(step: int, started: float, state: State) -> HistoryStep:
 def _solve_traced(
     problem: Problem, loss: AbstractLoss, solver: AbstractSchurSolver, plan: Plan, max_nfev: int
 ) -> Solution:
+    problem, loss = eqxi.nondifferentiable((problem, loss), msg=_NO_DERIVATIVE)
     dtype = jnp.result_type(float)
     system = make_system(problem, plan, loss, dtype)
     plain = _without_losses(system)

@@ -1,0 +1,40 @@
+"""Stage start: start values of poses, cameras and points."""
+
+from dataclasses import dataclass
+
+from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.scene import Block, Photo, Reference, Tracks, ViewGraph
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """- `photos`, `reference`, `view_graph`, `tracks`: of the stages before."""
+
+    photos: tuple[Photo, ...]
+    reference: Reference
+    view_graph: ViewGraph
+    tracks: Tracks
+
+
+@dataclass(frozen=True, kw_only=True)
+class Params(Parameters):
+    """What the user may set."""
+
+    camera_model: str = parameter(
+        "OPENCV",
+        choices=("SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
+        help="camera model of all photos",
+    )
+    min_angle: float = parameter(1.5, low=0.1, high=10, help="least angle between two rays of a point, degrees")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """- `block`: start values of the largest component."""
+
+    block: Block
+
+
+def run(inputs: Inputs, params: Params) -> Outputs:
+    """Find start values for the largest component."""
+    raise NotImplementedError

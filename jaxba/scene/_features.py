@@ -1,0 +1,37 @@
+"""Features of one image: keypoints in pixels, their descriptors, their colours."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+Detector = Literal["sift", "orb", "akaze"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Features:
+    """Keypoints of one image, in the order of falling strength, with descriptors in the same order.
+
+    - `xy_px`: the centre of the first pixel is (0.5, 0.5). `size_px`: diameter. `angle_rad`: of the keypoint.
+    - `descriptors`: C-contiguous; SIFT 128 integral values, ORB 32 bytes of bits.
+    - `rgb`: colour of the image at each keypoint.
+    - `mean_brightness`: of the image, 0 to 255. `coverage`: share of an 8 x 8 grid's cells that hold a keypoint.
+    - `notes`: what was odd, such as a frame without texture.
+
+    A frame without texture has zero keypoints: arrays of length 0, never None.
+    """
+
+    detector: Detector
+    xy_px: Float[np.ndarray, "keypoints 2"]
+    size_px: Float[np.ndarray, " keypoints"]
+    angle_rad: Float[np.ndarray, " keypoints"]
+    descriptors: UInt8[np.ndarray, "keypoints length"]
+    rgb: UInt8[np.ndarray, "keypoints 3"]
+    mean_brightness: float
+    coverage: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def num_keypoints(self) -> int:
+        return self.xy_px.shape[0]

@@ -1,0 +1,52 @@
+"""The survey's place on earth: the local frame of the adjustment, and each image's measured position and attitude in it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxba.scene._photo import Left
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalFrame:
+    """Local east, north, up in metres around a geodetic origin, and the CRS that results go to.
+
+    - `latitude_deg`, `longitude_deg`, `height_m`: origin on WGS 84; the height is in the photos' own height system.
+    - `crs`: the target CRS, as an authority code where it has one (`EPSG:32615`), else as WKT. `epsg`: its code.
+    - `crs_name`: for people. `unit`: of its axes, such as `metre` or `US survey foot`.
+    - `height_note`: in one sentence, what the heights of all results are above, and how that is known.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    crs: str
+    epsg: int | None
+    crs_name: str
+    unit: str
+    height_note: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reference:
+    """Measured positions and attitudes in the local frame, one row an image; NaN where there is none.
+
+    - `frame`: None where no image has a position: the block is then adjusted without a place on earth.
+    - `xyz_m`, `std_m`: position and its sigma an axis (east, north, up), metres.
+    - `quaternion`: attitude, `cam_from_world`, scalar first. `attitude_std_rad`: its sigma about each axis.
+    - `is_used`: the position is trusted enough to be a prior.
+    - `height_above_ground_m`: from the flight's relative altitude; NaN where it is unknown.
+    - `review`: images whose position is not used, with the reason.
+    - `notes`: what was found and decided, in sentences.
+    """
+
+    frame: LocalFrame | None
+    xyz_m: Float[np.ndarray, "images 3"]
+    std_m: Float[np.ndarray, "images 3"]
+    quaternion: Float[np.ndarray, "images 4"]
+    attitude_std_rad: Float[np.ndarray, "images 3"]
+    is_used: Bool[np.ndarray, " images"]
+    height_above_ground_m: Float[np.ndarray, " images"]
+    review: tuple[Left, ...] = ()
+    notes: tuple[str, ...] = ()

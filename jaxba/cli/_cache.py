@@ -5,6 +5,7 @@
 
 import logging
 import os
+import sys
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
@@ -16,8 +17,10 @@ def use_compilation_cache() -> None:
     jax's own environment variables, such as `JAX_COMPILATION_CACHE_DIR`, win. Without a folder that may be written to,
     everything works, only slower.
     """
-    import jax
-
+    settings = {
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = cache_folder()
         try:
@@ -28,13 +31,13 @@ def use_compilation_cache() -> None:
         if not os.access(folder, os.W_OK | os.X_OK):
             _log.info("compiled code is not kept: %s may not be written to", folder)
             return
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-    for name, value in (
-        ("jax_persistent_cache_min_compile_time_secs", 0.0),
-        ("jax_persistent_cache_min_entry_size_bytes", -1),
-    ):
-        if name.upper() not in os.environ:
-            jax.config.update(name, value)
+        settings["jax_compilation_cache_dir"] = str(folder)
+    for name, value in settings.items():
+        if name.upper() in os.environ:
+            continue
+        os.environ[name.upper()] = str(value)  # for a jax that is loaded later, if at all
+        if "jax" in sys.modules:
+            sys.modules["jax"].config.update(name, value)
 
 
 def cache_folder() -> Path:

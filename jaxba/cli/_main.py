@@ -78,6 +78,52 @@ def info(
     return run(file, as_json=json)
 
 
+@app.command(help="From a folder of photos to a georeferenced sparse cloud; what is unchanged is not done again.")
+def run(
+    photos: Annotated[Path, Parameter(help="The folder of photos.")],
+    /,
+    *,
+    crs: Annotated[str | None, Parameter(help="Projected CRS of the results: EPSG:32615. [default: UTM]")] = None,
+    out: Annotated[Path, Parameter(help="The project folder.")] = Path("project"),
+    stage: Annotated[str | None, Parameter(help="Stop after this stage: metadata, crs, features, pairs, ...")] = None,
+    set_: Annotated[
+        tuple[str, ...],
+        Parameter(name="--set", negative="", show_default=False, help="A parameter: match.ratio=0.7; once for each."),
+    ] = (),
+    focal: Annotated[float | None, Parameter(help="Focal length in pixels, in place of the tags'.")] = None,
+    geotags: Annotated[
+        Path | None, Parameter(help="A geo.txt or CSV in place of the tags. [default: geo.txt among the photos]")
+    ] = None,
+    require_connected: Annotated[
+        bool, Parameter(negative="", show_default=False, help="Stop where the photos fall into several groups.")
+    ] = False,
+    workers: Annotated[int | None, Parameter(help="Processes for features and matches. [default: one a core]")] = None,
+    max_memory: Annotated[float, Parameter(help="Share of the machine's memory for them, or bytes.")] = 0.8,
+    json: Annotated[
+        bool, Parameter(negative="", show_default=False, help="Print one JSON object on standard output.")
+    ] = False,
+    quiet: Annotated[
+        bool, Parameter(negative="", show_default=False, help="Print no progress and no summary.")
+    ] = False,
+) -> int:
+    from jaxba.cli._run import run
+
+    return run(
+        photos,
+        out=out,
+        crs=crs,
+        focal=focal,
+        geotags=geotags,
+        stage=stage,
+        changes=set_,
+        require_connected=require_connected,
+        workers=workers,
+        max_memory=max_memory,
+        as_json=json,
+        quiet=quiet,
+    )
+
+
 @app.command(help="Write a synthetic UAV survey as a tile, with the truth as extra_truth_... arrays.")
 def synthetic(
     out: Annotated[Path, Parameter(help="The tile to write.")],

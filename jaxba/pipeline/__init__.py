@@ -1,1 +1,43 @@
-"""From photos to a georeferenced cloud: one module a stage, wired by `_stages.py` and run by `_runner.py`."""
+"""From photos to a georeferenced cloud: one module a stage, wired by `_stages.py` and run by `_runner.py`.
+
+`import jaxba.pipeline` loads nothing else: a worker that runs one stage loads that stage alone (PEP 562).
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxba.pipeline._runner import Event, Run, run_pipeline
+    from jaxba.pipeline._settings import changed, default_settings
+    from jaxba.pipeline._stages import NAMES, STAGES
+    from jaxba.pipeline._summary import stage_lines, summary
+    from jaxba.pipeline._workers import Resources
+
+__all__ = [
+    "NAMES", "STAGES", "Event", "Resources", "Run", "changed", "default_settings", "run_pipeline", "stage_lines",
+    "summary",
+]  # fmt: skip
+
+_MODULE_OF = {
+    "NAMES": "_stages",
+    "STAGES": "_stages",
+    "Event": "_runner",
+    "Resources": "_workers",
+    "Run": "_runner",
+    "changed": "_settings",
+    "default_settings": "_settings",
+    "run_pipeline": "_runner",
+    "stage_lines": "_summary",
+    "summary": "_summary",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'jaxba.pipeline' has no attribute {name!r}")
+    globals()[name] = value = getattr(importlib.import_module(f"jaxba.pipeline.{_MODULE_OF[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -14,7 +14,12 @@ from jaxba._errors import JaxbaError
 
 
 def parameter(
-    default: Any, *, help: str, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()
+    default: Any,
+    *,
+    help: str,
+    low: float | int | None = None,
+    high: float | int | None = None,
+    choices: tuple[str, ...] = (),
 ) -> Any:
     """Return a dataclass field with this default, range (both ends allowed) or choices, and meaning."""
     return dataclasses.field(default=default, metadata={"help": help, "low": low, "high": high, "choices": choices})

@@ -47,7 +47,9 @@ class Done:
         frame = self.crs.reference.frame
         if frame is None:
             return self.crs.reference
-        frame = dataclasses.replace(frame, crs="", epsg=None, crs_name="", unit="", height_note="")
+        frame = dataclasses.replace(
+            frame, crs="", epsg=None, crs_name="", unit="", height_note="", height_datum="", height_unit=""
+        )
         return dataclasses.replace(self.crs.reference, frame=frame, review=(), notes=())
 
 

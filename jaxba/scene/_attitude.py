@@ -1,8 +1,8 @@
 """Attitudes as drones write them, and the rotation that they mean.
 
 Yaw, pitch and roll turn a camera that looks along the aircraft's nose: yaw clockwise from true north, pitch up from the
-horizon (-90 looks straight down), roll clockwise about the viewing direction, in the order yaw, pitch, roll (z-y'-x'' in
-north-east-down), which is DJI's gimbal convention. Other conventions are converted where they are read.
+horizon (-90 looks straight down), roll clockwise about the viewing direction, in the order yaw, pitch, roll (z-y'-x''
+in north-east-down), which is DJI's gimbal convention. Other conventions are converted where they are read.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The survey's place on earth: the local frame of the adjustment, and each image's measured position and attitude in it."""
+"""The survey's place on earth: the local frame of the adjustment, and what was measured of each image in it."""
 
 from dataclasses import dataclass
 
@@ -16,6 +16,8 @@ class LocalFrame:
     - `crs`: the target CRS, as an authority code where it has one (`EPSG:32615`), else as WKT. `epsg`: its code.
     - `crs_name`: for people. `unit`: of its axes, such as `metre` or `US survey foot`.
     - `height_note`: in one sentence, what the heights of all results are above, and how that is known.
+    - `height_datum`: what the photos' heights, and so the local frame's, are above: `ellipsoidal`, `mean_sea_level`,
+      `unknown`, or a vertical CRS such as `EPSG:5773`. `height_unit`: of the heights of results in the target CRS.
     """
 
     latitude_deg: float
@@ -26,6 +28,8 @@ class LocalFrame:
     crs_name: str
     unit: str
     height_note: str
+    height_datum: str = "unknown"
+    height_unit: str = "metre"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +37,8 @@ class Reference:
     """Measured positions and attitudes in the local frame, one row an image; NaN where there is none.
 
     - `frame`: None where no image has a position: the block is then adjusted without a place on earth.
-    - `xyz_m`, `std_m`: position and its sigma an axis (east, north, up), metres.
+    - `xyz_m`, `std_m`: position and its sigma an axis (east, north, up), metres. Where a height is missing or not to be
+      trusted, its sigma is infinite and the origin's height stands in for it.
     - `quaternion`: attitude, `cam_from_world`, scalar first. `attitude_std_rad`: its sigma about each axis.
     - `is_used`: the position is trusted enough to be a prior.
     - `height_above_ground_m`: from the flight's relative altitude; NaN where it is unknown.

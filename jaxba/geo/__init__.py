@@ -1,0 +1,26 @@
+"""Places on earth: WGS 84, the survey's local frame, projected CRSs, heights, and which measured positions to trust.
+
+Arrays in, arrays out. Order is always x (east or longitude), then y (north or latitude), whatever a CRS's own order is.
+"""
+
+from jaxba.geo._attitudes import local_attitudes
+from jaxba.geo._crs import describe, parse_crs, target_crs, utm_zone
+from jaxba.geo._frame import (
+    geodetic_from_local,
+    local_frame,
+    local_from_geodetic,
+    local_from_projected,
+    projected_from_local,
+)
+from jaxba.geo._gates import HeightDrift, Judgement, judge_positions
+from jaxba.geo._heights import HeightStep, height_step
+from jaxba.geo._notes import UNTRUSTED, frame_notes, height_notes
+from jaxba.geo._operation import Operation, horizontal_operation
+from jaxba.geo._positions import Measured, measured_positions
+
+__all__ = [
+    "UNTRUSTED", "HeightDrift", "HeightStep", "Judgement", "Measured", "Operation", "describe", "frame_notes",
+    "geodetic_from_local", "height_notes", "height_step", "horizontal_operation", "judge_positions", "local_attitudes",
+    "local_frame", "local_from_geodetic", "local_from_projected", "measured_positions", "parse_crs",
+    "projected_from_local", "target_crs", "utm_zone",
+]  # fmt: skip

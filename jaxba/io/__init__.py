@@ -11,23 +11,52 @@ from jaxba.io._atomic import refuse_same_file, write_atomically
 
 if TYPE_CHECKING:
     from jaxba.io._bal import read_bal, what_bal_cannot_hold, write_bal
+    from jaxba.io._cloud import Cloud
+    from jaxba.io._colmap import write_colmap_binary, write_colmap_text
+    from jaxba.io._crs import CrsText
+    from jaxba.io._csv_cloud import write_csv_cloud
+    from jaxba.io._geopackage import write_geojson, write_geopackage
+    from jaxba.io._geotag_match import match_geotags
+    from jaxba.io._geotags import Geotag, Geotags, parse_geotags
+    from jaxba.io._las import write_las
+    from jaxba.io._opensfm import write_opensfm
+    from jaxba.io._ply import write_ply
     from jaxba.io._problem import read_problem
     from jaxba.io._schema import SCHEMA, schema_markdown
+    from jaxba.io._sites import Sites, make_sites
     from jaxba.io._tile import read_tile, write_tile
 
 __all__ = [
-    "SCHEMA", "read_bal", "read_problem", "read_tile", "refuse_same_file", "schema_markdown", "what_bal_cannot_hold",
-    "write_atomically", "write_bal", "write_tile",
+    "SCHEMA", "Cloud", "CrsText", "Geotag", "Geotags", "Sites", "make_sites", "match_geotags", "parse_geotags",
+    "read_bal", "read_problem", "read_tile", "refuse_same_file", "schema_markdown", "what_bal_cannot_hold",
+    "write_atomically", "write_bal", "write_colmap_binary", "write_colmap_text", "write_csv_cloud", "write_geojson",
+    "write_geopackage", "write_las", "write_opensfm", "write_ply", "write_tile",
 ]  # fmt: skip
 
 _MODULE_OF = {
     "SCHEMA": "jaxba.io._schema",
+    "Cloud": "jaxba.io._cloud",
+    "CrsText": "jaxba.io._crs",
+    "Geotag": "jaxba.io._geotags",
+    "Geotags": "jaxba.io._geotags",
+    "Sites": "jaxba.io._sites",
+    "make_sites": "jaxba.io._sites",
+    "match_geotags": "jaxba.io._geotag_match",
+    "parse_geotags": "jaxba.io._geotags",
     "read_bal": "jaxba.io._bal",
     "read_problem": "jaxba.io._problem",
     "read_tile": "jaxba.io._tile",
     "schema_markdown": "jaxba.io._schema",
     "what_bal_cannot_hold": "jaxba.io._bal",
     "write_bal": "jaxba.io._bal",
+    "write_colmap_binary": "jaxba.io._colmap",
+    "write_colmap_text": "jaxba.io._colmap",
+    "write_csv_cloud": "jaxba.io._csv_cloud",
+    "write_geojson": "jaxba.io._geopackage",
+    "write_geopackage": "jaxba.io._geopackage",
+    "write_las": "jaxba.io._las",
+    "write_opensfm": "jaxba.io._opensfm",
+    "write_ply": "jaxba.io._ply",
     "write_tile": "jaxba.io._tile",
 }
 

@@ -62,7 +62,7 @@ def read_record(folder: Path) -> Record | None:
 
 
 def load(folder: Path, cls: type[T]) -> T:
-    """Return what was saved, its arrays memory-mapped and read-only."""
+    """Return what was saved, its arrays memory-mapped; what is written into them never reaches the file."""
     content = _content(folder)
     if content is None:
         raise JaxbaError(f"{folder}: the record is missing or damaged; run again to make it anew.")
@@ -166,7 +166,7 @@ def _files_to_arrays(tree: Any, folder: Path) -> Any:
         if _ARRAY in tree:
             path = folder / tree[_ARRAY]
             try:
-                array = np.load(path, mmap_mode="r", allow_pickle=False)
+                array = np.load(path, mmap_mode="c", allow_pickle=False)
             except ValueError as error:  # an array of no elements cannot be mapped
                 if "mmap" not in str(error):
                     raise JaxbaError(f"{path}: damaged ({error}); delete its folder and run again.") from error

@@ -1,9 +1,23 @@
-"""Stage metadata: what each photo's tags and header tell; what cannot be used is left out and named."""
+"""Stage metadata: what each photo's tags and header tell; what cannot be used is left out and named.
 
+Photos are the files with an image's suffix; RAW files are left out, and other files are counted. Of files with equal
+contents the first by name stays. A geo.txt or CSV replaces position, accuracy and, where it has angles, attitude of the
+photos that it lists; the height above take-off stays that of the tags. No pixel is decoded here.
+"""
+
+import dataclasses
+from collections import Counter
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 
+from jaxba._errors import JaxbaError
+from jaxba.io import Geotag, match_geotags, parse_geotags
 from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.scene import Left, Photo, PhotoFile
+from jaxba.scene import Attitude, Left, Photo, PhotoFile
+from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
+
+_SHOWN = 3
+_MOST_NOTES = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,5 +47,105 @@ class Outputs:
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
-    """Read the tags of every photo."""
-    raise NotImplementedError
+    """Read the tags of every photo.
+
+    Raises:
+        JaxbaError: no file is a photo, none can be used, or the list that replaces the tags cannot be read.
+    """
+    geotags = None if inputs.geotags is None else parse_geotags(inputs.geotags, inputs.geotags_name)
+    files = sorted(inputs.files, key=lambda file: file.name)
+    images = [file for file in files if _suffix(file) in IMAGE_SUFFIXES]
+    if not images:
+        raise JaxbaError(f"there is no photo: the folder holds {_counted(files)}; give one with JPEG or TIFF photos.")
+    left_out = [Left(name=f.name, reason=_RAW_CURE) for f in files if _suffix(f) in RAW_SUFFIXES]
+    photos: list[Photo] = []
+    first: dict[str, str] = {}
+    for file in images:
+        if file.sha256 in first:
+            reason = f"is the same file as {first[file.sha256]}; delete one of them."
+            left_out.append(Left(name=file.name, reason=reason))
+            continue
+        first[file.sha256] = file.name
+        try:
+            photo = read_photo(file, focal_px=params.focal, max_focal_deviation=params.max_focal_deviation)
+        except JaxbaError as error:
+            reason = str(error).removeprefix(str(file.path)).lstrip(": ")
+            left_out.append(Left(name=file.name, reason=reason))
+            continue
+        photos.append(photo)
+    if not photos:
+        reasons = " ".join(f"{left.name}: {left.reason}" for left in left_out[:_SHOWN])
+        raise JaxbaError(f"none of the {len(images)} photos can be used. {reasons}")
+    notes = [*_file_notes(files), *_camera_notes(photos, params.focal), *_photo_notes(photos)]
+    if geotags is not None:
+        entries, found = match_geotags(geotags, [photo.name for photo in photos], inputs.geotags_name)
+        photos = [_tagged(photo, entries.get(photo.name), geotags.is_nadir_zero) for photo in photos]
+        notes += found
+    left_out.sort(key=lambda left: left.name)
+    return Outputs(photos=tuple(photos), left_out=tuple(left_out), notes=tuple(notes))
+
+
+_RAW_CURE = "is a RAW or HEIC file, which is not read; develop or convert it to JPEG or TIFF with its tags."
+
+
+def _suffix(file: PhotoFile) -> str:
+    return PurePosixPath(file.name).suffix.lower()
+
+
+def _counted(files: list[PhotoFile]) -> str:
+    """Return how many files there are of each kind: `3 files: 2 .txt, 1 .srt`."""
+    counts = Counter(_suffix(file) or "without a suffix" for file in files)
+    kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
+    return f"{len(files)} file{'' if len(files) == 1 else 's'}" + (f": {kinds}" if files else "")
+
+
+def _file_notes(files: list[PhotoFile]) -> list[str]:
+    others = [file for file in files if _suffix(file) not in (*IMAGE_SUFFIXES, *RAW_SUFFIXES)]
+    return [f"Files that are no photos are passed over, {_counted(others)}."] if others else []
+
+
+def _camera_notes(photos: list[Photo], focal_px: float | None) -> list[str]:
+    counts = Counter(photo.camera for photo in photos)
+    if len(counts) == 1:
+        return []
+    cameras = "; ".join(f"{name}: {count}" for name, count in sorted(counts.items()))
+    notes = [f"{len(counts)} cameras, each with its own intrinsics. Photos of each: {cameras}."]
+    if focal_px is not None:
+        notes.append(f"The given focal length, {focal_px:g} px, is used for all of them.")
+    return notes
+
+
+def _photo_notes(photos: list[Photo]) -> list[str]:
+    """Return what was odd about photos, each finding once with the photos that it concerns."""
+    names: dict[str, list[str]] = {}
+    for photo in photos:
+        for note in photo.notes:
+            names.setdefault(note, []).append(photo.name)
+    notes = [f"{_some(found)}: {note}" for note, found in sorted(names.items(), key=lambda item: -len(item[1]))]
+    if len(notes) > _MOST_NOTES:
+        more = len(notes) - _MOST_NOTES
+        return [
+            *notes[:_MOST_NOTES],
+            f"{more} more findings, each of as many photos or fewer, stand in the photos' notes.",
+        ]
+    return notes
+
+
+def _some(names: list[str]) -> str:
+    shown = ", ".join(names[:_SHOWN])
+    if len(names) <= _SHOWN:
+        return shown
+    return f"{len(names)} photos ({shown}, ...)"
+
+
+def _tagged(photo: Photo, entry: Geotag | None, is_nadir_zero: bool) -> Photo:
+    if entry is None:
+        return photo
+    relative_m = photo.position.relative_altitude_m if photo.position else None
+    attitude, angles = photo.attitude, entry.yaw_pitch_roll_deg
+    if angles is not None and is_nadir_zero:
+        attitude = attitude_from_nadir_body(*angles)
+    elif angles is not None:
+        attitude = Attitude(yaw_deg=angles[0], pitch_deg=angles[1], roll_deg=angles[2])
+    position = dataclasses.replace(entry.position, relative_altitude_m=relative_m)
+    return dataclasses.replace(photo, position=position, attitude=attitude)

@@ -1,0 +1,137 @@
+"""Matches between two sets of descriptors: exact two nearest neighbours, ratio test, mutual check.
+
+SIFT descriptors a are compared as sqrt(a / sum(a)) (Arandjelovic and Zisserman 2012, "Three things everyone should
+know"), which have unit length, so that the squared distance is 2 - 2 <a, b>: one blocked matrix product, in blocks of
+rows that stay in the cache, finds the nearest and the second nearest of each row, and the nearest of each column.
+8000 x 8000 takes 0.2 s on one core, 0.17 s of it in the product. Binary descriptors are compared by Hamming distance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from jaxba.scene import Features
+
+_BLOCK = 256
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Neighbours:
+    """For each row of the first set: its nearest in the second, distances, and whether the choice is mutual."""
+
+    index: Int[np.ndarray, " rows"]
+    nearest: Float[np.ndarray, " rows"]
+    second: Float[np.ndarray, " rows"]
+    is_mutual: Bool[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Descriptors:
+    """An image's descriptors ready to be compared, and for each the first feature at the same position.
+
+    SIFT gives a position one feature for each of its orientations. Leaving out all but one loses 15% of the inliers;
+    keeping them as they are gives a point two features of one image.
+    """
+
+    values: Float[np.ndarray, "rows length"] | UInt8[np.ndarray, "rows length"]
+    is_binary: bool
+    first_index: Int[np.ndarray, " rows"]
+
+
+def unit_descriptors(descriptors: UInt8[np.ndarray, "rows length"]) -> Float[np.ndarray, "rows length"]:
+    """Return the square roots of SIFT descriptors that sum to 1, float32 of unit length.
+
+    >>> unit_descriptors(np.array([[9, 16, 0, 0]], np.uint8)).tolist()
+    [[0.6000000238418579, 0.800000011920929, 0.0, 0.0]]
+    """
+    total = np.maximum(descriptors.sum(axis=1, dtype=np.int64), 1).astype(np.float32)
+    return np.sqrt(descriptors / total[:, None], dtype=np.float32)
+
+
+def two_nearest(first: Float[np.ndarray, "rows length"], second: Float[np.ndarray, "columns length"]) -> Neighbours:
+    """Return the two nearest in `second` of each row of `first`, both float32 of unit length, `second` of 2 at least.
+
+    Of equally near ones the lower index is taken, and of several rows that a column is equally near to only the first
+    is mutual.
+    """
+    num_rows, num_columns = len(first), len(second)
+    index = np.empty(num_rows, np.int64)
+    best, next_best = np.empty(num_rows, np.float32), np.empty(num_rows, np.float32)
+    column_best = np.full(num_columns, -np.inf, np.float32)
+    transposed = np.ascontiguousarray(second.T)
+    buffer = np.empty((_BLOCK, num_columns), np.float32)
+    for start in range(0, num_rows, _BLOCK):
+        rows = slice(start, min(start + _BLOCK, num_rows))
+        product = np.dot(first[rows], transposed, out=buffer[: rows.stop - start])
+        np.maximum(column_best, product.max(axis=0), out=column_best)
+        at = (np.arange(len(product)), product.argmax(axis=1))
+        index[rows], best[rows] = at[1], product[at]
+        product[at] = -np.inf
+        next_best[rows] = product.max(axis=1)
+    is_mutual = best == column_best[index]  # the same product, so equal to the last bit
+    candidates = np.flatnonzero(is_mutual)
+    is_mutual[:] = False
+    is_mutual[candidates[np.unique(index[candidates], return_index=True)[1]]] = True
+    return Neighbours(index=index, nearest=_distance(best), second=_distance(next_best), is_mutual=is_mutual)
+
+
+def two_nearest_hamming(
+    first: UInt8[np.ndarray, "rows length"], second: UInt8[np.ndarray, "columns length"]
+) -> Neighbours:
+    """Return the two nearest in `second`, of 2 at least, of each row of bits of `first`, by Hamming distance."""
+    import cv2
+
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    found = matcher.knnMatch(first, second, k=2)
+    back = np.array([m[0].trainIdx for m in matcher.knnMatch(second, first, k=1)])
+    index = np.array([m[0].trainIdx for m in found], np.int64)
+    distances = np.array([(m[0].distance, m[1].distance) for m in found]).reshape(-1, 2)
+    return Neighbours(
+        index=index,
+        nearest=distances[:, 0],
+        second=distances[:, 1],
+        is_mutual=back[index] == np.arange(len(index)),
+    )
+
+
+def ratio_matches(
+    neighbours: Neighbours, ratio: float
+) -> tuple[Int[np.ndarray, "matches 2"], Float[np.ndarray, " matches"]]:
+    """Return the mutual matches whose nearest is under `ratio` times the second nearest, and 1 - that ratio of each."""
+    n = neighbours
+    rows = np.flatnonzero(n.is_mutual & (n.nearest < ratio * n.second))
+    matches = np.stack([rows, n.index[rows]], axis=1)
+    return matches, 1.0 - np.asarray(n.nearest[rows], np.float64) / n.second[rows]
+
+
+def prepare_descriptors(features: Features) -> Descriptors:
+    """Return an image's descriptors made ready for `match_descriptors`."""
+    is_binary = features.detector != "sift"
+    values = features.descriptors if is_binary else unit_descriptors(features.descriptors)
+    _, first, place = np.unique(features.xy_px, axis=0, return_index=True, return_inverse=True)
+    return Descriptors(values=values, is_binary=is_binary, first_index=first[place.reshape(-1)])
+
+
+def match_descriptors(
+    first: Descriptors, second: Descriptors, ratio: float
+) -> tuple[Int[np.ndarray, "matches 2"], Float[np.ndarray, " matches"]]:
+    """Return matches by ratio test and mutual check, rising, and how distinct each is: 1 - nearest over second nearest.
+
+    Each position of an image is in one match at most.
+    """
+    if min(len(first.values), len(second.values)) < 2:
+        return np.zeros((0, 2), np.int64), np.zeros(0)
+    search = two_nearest_hamming if first.is_binary else two_nearest
+    matches, distinctiveness = ratio_matches(search(first.values, second.values), ratio)
+    matches = np.stack([first.first_index[matches[:, 0]], second.first_index[matches[:, 1]]], axis=1)
+    for side in (0, 1):  # of matches that share a position, the most distinct stays
+        order = np.lexsort([matches[:, 1 - side], -distinctiveness, matches[:, side]])
+        kept = np.sort(order[np.unique(matches[order, side], return_index=True)[1]])
+        matches, distinctiveness = matches[kept], distinctiveness[kept]
+    order = np.argsort(matches[:, 0], kind="stable")
+    return matches[order], distinctiveness[order]
+
+
+def _distance(similarity: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+    return np.sqrt(np.maximum(2.0 - 2.0 * similarity.astype(np.float64), 0.0))

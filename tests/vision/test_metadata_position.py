@@ -1,0 +1,228 @@
+"""Position, accuracy, heights and attitudes from the tags of each maker."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags
+from PIL.TiffImagePlugin import IFDRational
+from tagged_photos import NORTH_EAST, file_of, tagged
+
+from jaxba.scene import Attitude, cam_from_enu
+from jaxba.vision import attitude_from_nadir_body, read_photo
+
+GPS = ExifTags.GPS
+ALTITUDE = {GPS.GPSAltitude: 431.5, GPS.GPSAltitudeRef: b"\x00"}
+DJI = {
+    "drone-dji:AbsoluteAltitude": "+431.50",
+    "drone-dji:RelativeAltitude": "+80.10",
+    "drone-dji:GimbalYawDegree": "-127.10",
+    "drone-dji:GimbalPitchDegree": "-89.90",
+    "drone-dji:GimbalRollDegree": "+0.00",
+    "drone-dji:FlightYawDegree": "-97.00",
+    "drone-dji:FlightPitchDegree": "+0.90",
+    "drone-dji:FlightRollDegree": "-3.20",
+}
+
+
+def degrees(yaw: float, pitch: float, roll: float) -> Attitude:
+    return Attitude(yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
+
+
+def test_tags_of_a_real_dji_are_those_that_stand_in_its_file(data_dir: Path):
+    for path in sorted((data_dir / "images" / "brighton").glob("*.JPG")):
+        content = path.read_bytes().decode("latin-1")
+
+        def written(name: str, content: str = content) -> float:
+            found = re.search(rf"<drone-dji:{name}>([^<]*)</", content)
+            assert found is not None
+            return float(found[1])
+
+        photo = read_photo(file_of(path))
+        assert photo.attitude == degrees(*(written(f"Gimbal{a}Degree") for a in ("Yaw", "Pitch", "Roll")))
+        assert photo.flight_attitude == degrees(*(written(f"Flight{a}Degree") for a in ("Yaw", "Pitch", "Roll")))
+        assert photo.position is not None
+        assert photo.position.relative_altitude_m == written("RelativeAltitude")
+        assert photo.position.z_m == pytest.approx(written("AbsoluteAltitude"), abs=0.01)
+        assert photo.position.height_kind == "unknown"  # of a DJI without RTK
+
+
+def test_real_position_in_degrees(data_dir: Path):
+    photo = read_photo(file_of(data_dir / "images" / "brighton" / "DJI_0018.JPG"))
+    assert photo.position is not None
+    # 46 deg 50' 33.3855" N, 91 deg 59' 40.4156" W
+    assert photo.position.y == pytest.approx(46 + 50 / 60 + 33.3855 / 3600, abs=1e-12)
+    assert photo.position.x == pytest.approx(-(91 + 59 / 60 + 40.4156 / 3600), abs=1e-12)
+    assert (photo.position.crs, photo.time) == ("EPSG:4326", "2016-06-23T16:31:59")
+
+
+def test_height_that_exif_rounds_has_the_digits_of_xmp(data_dir: Path):
+    position = read_photo(file_of(data_dir / "exif" / "issue-exifr-13.jpg")).position
+    assert position is not None
+    assert (position.z_m, position.relative_altitude_m) == (1252.12, 125.3)  # EXIF: 1252
+
+
+def test_altitude_type_speaks_for_a_photo_without_a_flag(tmp_path: Path):
+    xmp = {**DJI, "drone-dji:AltitudeType": "RtkAlt"}
+    with_type = tagged(tmp_path, gps={**NORTH_EAST, **ALTITUDE}, xmp=xmp).position
+    failed = tagged(tmp_path, gps={**NORTH_EAST, **ALTITUDE}, xmp={**xmp, "drone-dji:RtkFlag": "0"}).position
+    assert with_type is not None and with_type.height_kind == "ellipsoidal"
+    assert failed is not None and failed.height_kind == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("flag", "fix", "kind"),
+    [
+        ("50", "rtk_fixed", "ellipsoidal"),
+        ("34", "rtk_float", "ellipsoidal"),
+        ("16", "single", "ellipsoidal"),
+        ("0", "unknown", "unknown"),
+    ],
+)
+def test_rtk_flag_tells_fix_and_height_system(tmp_path: Path, flag: str, fix: str, kind: str):
+    rtk = {"RtkFlag": flag, "RtkStdLon": "0.01102", "RtkStdLat": "0.01213", "RtkStdHgt": "0.02441"}
+    xmp = {**DJI, **{f"drone-dji:{name}": value for name, value in rtk.items()}}
+    photo = tagged(tmp_path, make="DJI", model="FC6310R", gps={**NORTH_EAST, **ALTITUDE}, xmp=xmp)
+    assert photo.position is not None
+    assert (photo.position.fix, photo.position.height_kind) == (fix, kind)
+    assert photo.position.std_h_m == pytest.approx(np.sqrt((0.01102**2 + 0.01213**2) / 2))
+    assert photo.position.std_v_m == 0.02441
+    assert photo.position.relative_altitude_m == 80.1 and photo.position.z_m == 431.5
+    assert ("RtkFlag 0" in " ".join(photo.notes)) == (flag == "0")
+
+
+def test_finer_position_of_xmp_is_taken_only_where_exif_agrees(tmp_path: Path):
+    finer = {"drone-dji:GpsLatitude": "47.5100000123", "drone-dji:GpsLongitude": "8.2500000321"}
+    photo = tagged(tmp_path, gps=NORTH_EAST, xmp=finer)
+    assert photo.position is not None
+    assert (photo.position.y, photo.position.x, photo.position.source) == (47.5100000123, 8.2500000321, "XMP")
+    older = {"drone-dji:GpsLatitude": "47.512", "drone-dji:GpsLongtitude": "8.25"}
+    photo = tagged(tmp_path, gps=NORTH_EAST, xmp=older)
+    assert photo.position is not None
+    assert (photo.position.y, photo.position.source) == (pytest.approx(47.51), "EXIF")
+    assert "XMP 47.5120000" in " ".join(photo.notes)
+
+
+def test_position_in_xmp_alone(tmp_path: Path):
+    xmp = {"drone:GpsLatitude": "-33.5", "drone:GpsLongtitude": "-70.25", "drone:RelativeAltitude": "60"}
+    photo = tagged(tmp_path, make="Autel Robotics", model="XT705", xmp=xmp)
+    assert photo.position is not None
+    assert (photo.position.y, photo.position.x, photo.position.relative_altitude_m) == (-33.5, -70.25, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("ref", "z_m", "kind"),
+    [
+        (b"\x00", 431.5, "mean_sea_level"),
+        (b"\x01", -431.5, "mean_sea_level"),
+        (b"\x02", 431.5, "ellipsoidal"),
+        (b"\x03", -431.5, "ellipsoidal"),
+        (None, 431.5, "unknown"),
+    ],
+)
+def test_altitude_reference_tells_sign_and_height_system(tmp_path: Path, ref: bytes | None, z_m: float, kind: str):
+    altitude = {GPS.GPSAltitude: 431.5} | ({} if ref is None else {GPS.GPSAltitudeRef: ref})
+    photo = tagged(tmp_path, gps={**NORTH_EAST, **altitude})
+    assert photo.position is not None
+    assert (photo.position.z_m, photo.position.height_kind) == (z_m, kind)
+
+
+def test_south_and_west_are_negative_and_decimal_minutes_are_read(tmp_path: Path):
+    gps = {
+        GPS.GPSLatitudeRef: "S",
+        GPS.GPSLatitude: (IFDRational(33), IFDRational(30303, 1000), IFDRational(0)),
+        GPS.GPSLongitudeRef: "W",
+        GPS.GPSLongitude: (IFDRational(70), IFDRational(15), IFDRational(0)),
+    }
+    position = tagged(tmp_path, gps=gps).position
+    assert position is not None
+    assert (position.y, position.x) == (pytest.approx(-(33 + 30.303 / 60)), -70.25)
+
+
+@pytest.mark.parametrize(
+    ("change", "note"),
+    [
+        ({GPS.GPSLatitude: (IFDRational(0, 0), IFDRational(0, 0), IFDRational(0, 0))}, "GPSLatitude (nan, nan, nan)"),
+        ({GPS.GPSLatitude: (IFDRational(97), IFDRational(0), IFDRational(0))}, "position 97, 8.25 is out of range"),
+        (
+            {GPS.GPSLatitude: (IFDRational(0),) * 3, GPS.GPSLongitude: (IFDRational(0),) * 3},
+            "position 0, 0 is what a receiver without a fix writes",
+        ),
+    ],
+)
+def test_impossible_position_counts_as_absent_and_is_named(tmp_path: Path, change: dict, note: str):
+    photo = tagged(tmp_path, gps={**NORTH_EAST, **change})
+    assert photo.position is None
+    assert note in " ".join(photo.notes)
+
+
+def test_missing_hemisphere_is_assumed_and_said(tmp_path: Path):
+    photo = tagged(tmp_path, gps={tag: value for tag, value in NORTH_EAST.items() if tag != GPS.GPSLongitudeRef})
+    assert photo.position is not None and photo.position.x == 8.25
+    assert "E is assumed" in " ".join(photo.notes)
+
+
+def test_height_with_a_zero_denominator_counts_as_absent(tmp_path: Path):
+    photo = tagged(tmp_path, gps={**NORTH_EAST, GPS.GPSAltitude: IFDRational(5, 0)})
+    assert photo.position is not None
+    assert (photo.position.z_m, photo.position.height_kind) == (None, "unknown")
+    assert "GPSAltitude" in " ".join(photo.notes)
+
+
+def test_stated_accuracy_of_plain_cameras_and_of_pix4ds_tags(tmp_path: Path):
+    plain = tagged(tmp_path, gps={**NORTH_EAST, GPS.GPSHPositioningError: 3.5, GPS.GPSDOP: 1.5}).position
+    assert plain is not None and (plain.std_h_m, plain.std_v_m) == (3.5, None)
+    pix4d = tagged(
+        tmp_path, gps=NORTH_EAST, xmp={"Camera:GPSXYAccuracy": "1/50", "Camera:GPSZAccuracy": "0.05"}
+    ).position
+    assert pix4d is not None and (pix4d.std_h_m, pix4d.std_v_m) == (0.02, 0.05)
+
+
+def test_differential_correction_and_poor_dilution_are_told(tmp_path: Path):
+    photo = tagged(tmp_path, gps={**NORTH_EAST, GPS.GPSDifferential: 1, GPS.GPSDOP: 12.0})
+    assert photo.position is not None and photo.position.fix == "differential"
+    assert "GPSDOP 12" in " ".join(photo.notes)
+
+
+def test_attitudes_of_dji_autel_and_parrot(tmp_path: Path):
+    dji = tagged(tmp_path, xmp=DJI)
+    assert (dji.attitude, dji.flight_attitude) == (degrees(-127.1, -89.9, 0.0), degrees(-97.0, 0.9, -3.2))
+    autel = {name.replace("drone-dji", "drone"): value for name, value in DJI.items()}
+    assert tagged(tmp_path, xmp=autel).attitude == dji.attitude
+    parrot = {
+        "drone-parrot:CameraYawDegree": "176.310745",
+        "drone-parrot:CameraPitchDegree": "-78.362686",
+        "drone-parrot:CameraRollDegree": "-0.322913",
+    }
+    assert tagged(tmp_path, xmp=parrot).attitude == degrees(176.310745, -78.362686, -0.322913)
+
+
+def test_gimbal_that_knows_nothing_writes_zeros(tmp_path: Path):
+    zeros = {f"drone-dji:Gimbal{angle}Degree": "+0.00" for angle in ("Yaw", "Pitch", "Roll")}
+    photo = tagged(tmp_path, xmp=zeros)
+    assert photo.attitude is None
+    assert "all 0" in " ".join(photo.notes)
+
+
+@pytest.mark.parametrize("space", ["Camera", "sensefly"])
+def test_camera_tags_are_turned_to_the_gimbals_convention(tmp_path: Path, space: str):
+    # an Autel whose camera looks 24 degrees under the horizon writes 66
+    xmp = {f"{space}:Yaw": "2.42", f"{space}:Pitch": "66.04", f"{space}:Roll": "0.00"}
+    attitude = tagged(tmp_path, xmp=xmp).attitude
+    assert attitude is not None
+    assert (attitude.yaw_deg, attitude.pitch_deg, attitude.roll_deg) == pytest.approx((2.42, -23.96, 0.0))
+
+
+@pytest.mark.parametrize("yaw", [0.0, 35.0, -120.0])
+@pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (5.0, 0.0), (-7.0, 12.0), (60.0, -20.0), (0.0, 8.0)])
+def test_axes_of_a_camera_under_a_body_are_the_bodys(yaw: float, pitch: float, roll: float):
+    enu_from_cam = cam_from_enu(attitude_from_nadir_body(yaw, pitch, roll)).T
+    y, p, r = np.radians([yaw, pitch, roll])
+    # the nose, in east, north, up: by yaw from north, lifted by pitch; the photo's top points there
+    nose = np.array([np.sin(y) * np.cos(p), np.cos(y) * np.cos(p), np.sin(p)])
+    np.testing.assert_allclose(-enu_from_cam[:, 1], nose, atol=1e-8)
+    # the right wing, level before the roll, sinks with a positive one; the photo's right side points there
+    level = np.array([np.cos(y), -np.sin(y), 0.0])
+    below = np.cross(nose, level)
+    np.testing.assert_allclose(enu_from_cam[:, 0], np.cos(r) * level + np.sin(r) * below, atol=1e-8)

@@ -124,6 +124,45 @@ def run(
     )
 
 
+@app.command(help="Write a small simulated survey: photos with tags, control points, the truth beside them.")
+def simulate(
+    out: Annotated[Path, Parameter(help="The folder to write.")],
+    /,
+    *,
+    images: Annotated[int, Parameter(help="Photos in all.")] = 24,
+    oblique: Annotated[int, Parameter(help="Of them tilted, looking at the middle of the block.")] = 4,
+    width: Annotated[int, Parameter(help="Of the photos, px; they are 4:3.")] = 1200,
+    height: Annotated[float, Parameter(help="Of the flight above the ground, m.")] = 70.0,
+    forward_overlap: Annotated[float, Parameter(help="Share of a photo seen again along the line.")] = 0.75,
+    side_overlap: Annotated[float, Parameter(help="Share of a photo seen again on the next line.")] = 0.6,
+    gnss_std: Annotated[
+        tuple[float, float], Parameter(help="Noise of positions, m: an axis across, and up; to 0.1 they count as RTK.")
+    ] = (0.03, 0.05),
+    attitude_std: Annotated[float, Parameter(help="Noise of the attitude tags, degrees.")] = 1.5,
+    control: Annotated[int, Parameter(help="Control points, in gcp_list.txt.")] = 5,
+    check: Annotated[int, Parameter(help="Check points, in check_list.txt.")] = 5,
+    mark_std: Annotated[float, Parameter(help="Noise of the marks in the lists, px.")] = 0.3,
+    seed: Annotated[int, Parameter(help="The same seed gives the same survey.")] = 0,
+) -> int:
+    from jaxba.cli._simulate import run
+
+    return run(
+        out,
+        images=images,
+        oblique=oblique,
+        width=width,
+        height=height,
+        forward_overlap=forward_overlap,
+        side_overlap=side_overlap,
+        gnss_std=gnss_std,
+        attitude_std=attitude_std,
+        control=control,
+        check=check,
+        mark_std=mark_std,
+        seed=seed,
+    )
+
+
 @app.command(help="Write a synthetic UAV survey as a tile, with the truth as extra_truth_... arrays.")
 def synthetic(
     out: Annotated[Path, Parameter(help="The tile to write.")],

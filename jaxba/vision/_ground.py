@@ -63,7 +63,7 @@ def paint_ground(
     >>> ends = {"low_m": np.array([0.0, 0.0]), "high_m": np.array([8.0, 6.0])}
     >>> ground = paint_ground(np.random.default_rng(0), flat, **ends, texel_m=0.1, targets_m=np.empty((0, 2)))
     >>> ground.texture.shape
-    (64, 80, 3)
+    (60, 80, 3)
     """
     columns, rows = (np.ceil((high_m - low_m) / (texel_m * _COARSE) - 1e-9).astype(int) * _COARSE).tolist()
     west, north = float(low_m[0]), float(high_m[1])

@@ -15,7 +15,8 @@ d is 2 for a homography and 3 for an epipolar geometry; k is 8 and 5 (essential)
 Planes. Matches that keep to the epipolar lines and lie off the plane by up to 20 thresholds are trees and roofs, 4 to
 7% of the inliers on flat nadir surveys, and tell most of heights: they stay. A homography decomposes to two poses that
 differ by some 10 degrees and fit points of the plane alike (Ma et al. 2004, "An invitation to 3-D vision", 5.3): of
-those that explain nine tenths of the inliers of the best, the one nearest to the attitudes is taken where they tell.
+those that explain nine tenths of the inliers of the best, the one nearest to the attitudes is taken where they tell. Attitudes
+that are far from all of them, as of photos stored upside down, are not believed.
 
 Cost: about 5 ms a pair of some hundred matches.
 """
@@ -29,6 +30,7 @@ from jaxtyping import Bool, Float
 _ITERATIONS = {"min_iterations": 100, "max_iterations": 5000}
 _MAGSAC_ITERATIONS = 5000
 _RELIEF = 20.0
+_BELIEVABLE_RAD = 0.25
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -213,22 +215,26 @@ def _nearest_pose(
             candidates.append(refined)
     distances = [sampson_px(_fundamental_of(candidate, first, second), x, y) for candidate in candidates]
     explained = np.array([np.count_nonzero(distance < threshold_px) for distance in distances])
-    return min(
-        (c for c, count in zip(candidates, explained, strict=True) if count >= 0.9 * explained.max()),
-        key=lambda candidate: _misfit(candidate, prior),
-    )
+    possible = [c for c, count in zip(candidates, explained, strict=True) if count >= 0.9 * explained.max()]
+    nearest = min(possible, key=lambda candidate: _misfit(candidate, prior))
+    believable = max(_BELIEVABLE_RAD, 4 * prior.rotation_std_rad)
+    return nearest if _angle_rad(nearest, prior) < believable else pose
 
 
 def _misfit(pose: Any, prior: PosePrior) -> float:
     """Return the squared deviation from the prior in units of its sigmas."""
-    turn = np.asarray(pose.R) @ prior.rotation.T
-    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-    misfit = (angle / prior.rotation_std_rad) ** 2
+    misfit = (_angle_rad(pose, prior) / prior.rotation_std_rad) ** 2
     length = np.linalg.norm(pose.t)
     if prior.direction is not None and length > 0:
         angle = np.arccos(np.clip(np.asarray(pose.t) @ prior.direction / length, -1, 1))
         misfit += (angle / prior.direction_std_rad) ** 2
     return float(misfit)
+
+
+def _angle_rad(pose: Any, prior: PosePrior) -> float:
+    """Return the angle of the rotation between a pose and its prior."""
+    turn = np.asarray(pose.R) @ prior.rotation.T
+    return float(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
 
 
 def _camera(pinhole: Pinhole) -> dict[str, Any]:

@@ -1,13 +1,17 @@
-"""Stage match: verified matches of one photo with its candidate partners; the runner calls it once a photo, in workers."""
+"""Stage match: verified matches of one photo with its candidate partners; called once a photo, in workers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.scene import Features, Photo, Reference, ViewGraph
+from jaxba.scene import EdgeStatus, Features, Photo, Reference, ViewGraph
+from jaxba.vision import Pinhole, PosePrior, TwoView, grid_coverage, match_descriptors, prepare_descriptors, verify
+
+_ATTITUDE_STD_RAD = 0.05  # where the reference states none
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,5 +53,103 @@ class Outputs:
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
-    """Match one photo with its partners and verify the matches."""
-    raise NotImplementedError
+    """Match one photo with its partners and verify the matches.
+
+    Keypoints at one position, of several orientations, all take part; matches speak of the first of them. A pair that
+    fails is an edge of status `REJECTED`, without matches, its figures kept.
+    """
+    first = inputs.photos[inputs.image]
+    features = inputs.features[inputs.image]
+    prepared = prepare_descriptors(features)
+    parts = []
+    for partner, overlap in zip(inputs.partners.tolist(), inputs.overlap.tolist(), strict=True):
+        second = inputs.photos[partner]
+        others = inputs.features[partner]
+        matches, distinctiveness = match_descriptors(prepared, prepare_descriptors(others), params.ratio)
+        two_view = verify(
+            features.xy_px[matches[:, 0]],
+            others.xy_px[matches[:, 1]],
+            _pinhole(first),
+            _pinhole(second),
+            threshold_px=float(params.ransac_threshold or _threshold_px(first, second, overlap)),
+            confidence=float(params.confidence),
+            min_inliers=params.min_inliers,
+            prior=_prior(inputs.reference, inputs.image, partner),
+        )
+        inliers = matches[two_view.is_inlier]
+        coverage = min(
+            grid_coverage(features.xy_px[inliers[:, 0]], first.width_px, first.height_px),
+            grid_coverage(others.xy_px[inliers[:, 1]], second.width_px, second.height_px),
+        )
+        parts.append(_edge(inputs.image, partner, matches, distinctiveness, coverage, two_view, params))
+    return Outputs(view_graph=ViewGraph.concatenate(parts))
+
+
+def _edge(
+    image: int,
+    partner: int,
+    matches: Int[np.ndarray, "matches 2"],
+    distinctiveness: Float[np.ndarray, " matches"],
+    coverage: float,
+    two_view: TwoView,
+    params: Params,
+) -> ViewGraph:
+    """Return the view graph of one pair."""
+    inliers = matches[two_view.is_inlier]
+    status = EdgeStatus.REJECTED
+    if len(inliers) >= params.min_inliers:
+        is_good = len(inliers) >= params.min_good and len(inliers) >= params.min_inlier_ratio * len(matches)
+        status = EdgeStatus.GOOD if is_good else EdgeStatus.WEAK
+    has_pose = bool(np.isfinite(two_view.direction).all())
+    quaternion = np.full(4, np.nan)
+    if has_pose:
+        quaternion = Rotation.from_matrix(two_view.rotation).as_quat(scalar_first=True, canonical=True)
+    return ViewGraph(
+        pairs=np.array([[image, partner]], np.int32),
+        status=np.array([status], np.uint8),
+        offsets=np.array([0, len(inliers)], np.int64),
+        matches=inliers.astype(np.int32),
+        num_putative=np.array([len(matches)], np.int32),
+        is_planar=np.array([two_view.is_planar]),
+        quaternion=quaternion[None],
+        direction=two_view.direction[None],
+        residual_px=np.array([two_view.residual_px]),
+        distinctiveness=np.array([np.median(distinctiveness[two_view.is_inlier]) if len(inliers) else np.nan]),
+        angle_rad=np.array([two_view.angle_rad]),
+        coverage=np.array([coverage]),
+    )
+
+
+def _pinhole(photo: Photo) -> Pinhole:
+    return Pinhole(width_px=photo.width_px, height_px=photo.height_px, focal_px=photo.focal_px)
+
+
+def _threshold_px(first: Photo, second: Photo, overlap: float) -> float:
+    """Return the threshold that fits a pair's overlap and resolution; an unknown overlap counts as a low one."""
+    if overlap > 0.85:
+        return 2.0
+    return 4.0 if max(first.megapixels, second.megapixels) > 20 else 3.0
+
+
+def _prior(reference: Reference, i: int, j: int) -> PosePrior | None:
+    """Return what the attitudes of two images, and their positions, tell of their relative pose."""
+    quaternions = reference.quaternion[[i, j]]
+    if not np.isfinite(quaternions).all():
+        return None
+    rotation_i, rotation_j = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+    std_rad = float(np.sqrt(np.mean(reference.attitude_std_rad[[i, j]] ** 2) * 2))
+    std_rad = std_rad if np.isfinite(std_rad) and std_rad > 0 else _ATTITUDE_STD_RAD
+    rotation = rotation_j @ rotation_i.T
+    if not reference.is_used[[i, j]].all():
+        return PosePrior(rotation=rotation, rotation_std_rad=std_rad)
+    step_m = reference.xyz_m[i] - reference.xyz_m[j]
+    length_m = float(np.linalg.norm(step_m))
+    across_m = float(np.sqrt(np.sum(reference.std_m[[i, j]] ** 2) / 3))
+    if not length_m > 3 * across_m:  # the positions do not tell a direction
+        return PosePrior(rotation=rotation, rotation_std_rad=std_rad)
+    return PosePrior(
+        rotation=rotation,
+        rotation_std_rad=std_rad,
+        direction=rotation_j @ step_m / length_m,
+        direction_std_rad=float(np.hypot(std_rad, across_m / length_m)),
+    )

@@ -3,6 +3,7 @@
 import enum
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -30,6 +31,8 @@ class ViewGraph:
     - `residual_px`: median distance to the epipolar line, or of the homography's transfer; NaN without inliers.
     - `distinctiveness`: median of 1 - (distance to the nearest over the second nearest descriptor) of the inliers.
     - `angle_rad`: median angle between the rays of the inliers; NaN without a relative pose.
+    - `coverage`: share of an 8 x 8 grid's cells that hold an inlier, in the image where it is smaller; None where it
+      was not measured.
     """
 
     pairs: Int[np.ndarray, "pairs 2"]
@@ -43,6 +46,7 @@ class ViewGraph:
     residual_px: Float[np.ndarray, " pairs"]
     distinctiveness: Float[np.ndarray, " pairs"]
     angle_rad: Float[np.ndarray, " pairs"]
+    coverage: Float[np.ndarray, " pairs"] | None = None
 
     @property
     def num_inliers(self) -> Int[np.ndarray, " pairs"]:
@@ -64,20 +68,22 @@ class ViewGraph:
     def select(self, keep: Bool[np.ndarray, " pairs"]) -> "ViewGraph":
         """Return the view graph of some of the pairs."""
         counts = self.num_inliers
-        columns = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name not in ("offsets", "matches")}
+        per_pair = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("offsets", "matches")}
+        columns: dict[str, Any] = {name: None if c is None else c[keep] for name, c in per_pair.items()}
         offsets = np.concatenate([[0], np.cumsum(counts[keep])]).astype(np.int64)
         return ViewGraph(offsets=offsets, matches=self.matches[np.repeat(keep, counts)], **columns)
 
     @staticmethod
     def concatenate(parts: Sequence["ViewGraph"]) -> "ViewGraph":
         """Return the pairs of all parts, which hold different ones, in rising order."""
+        measured = all(part.coverage is not None for part in parts)
         parts = [ViewGraph.empty(), *parts]
-        names = [f.name for f in fields(ViewGraph) if f.name != "offsets"]
-        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        names = [f.name for f in fields(ViewGraph) if f.name != "offsets" and (measured or f.name != "coverage")]
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         counts = np.concatenate([part.num_inliers for part in parts])
         order = np.lexsort((columns["pairs"][:, 1], columns["pairs"][:, 0]))
-        starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
-        rows = [np.arange(starts[k], starts[k] + counts[k]) for k in order]
+        ends = np.cumsum(counts)
+        rows = [np.arange(int(ends[k] - counts[k]), int(ends[k])) for k in order]
         matches = columns.pop("matches")[np.concatenate(rows)] if rows else columns.pop("matches")
         offsets = np.concatenate([[0], np.cumsum(counts[order])]).astype(np.int64)
         return ViewGraph(offsets=offsets, matches=matches, **{name: c[order] for name, c in columns.items()})
@@ -97,4 +103,5 @@ class ViewGraph:
             residual_px=np.zeros(0),
             distinctiveness=np.zeros(0),
             angle_rad=np.zeros(0),
+            coverage=np.zeros(0),
         )

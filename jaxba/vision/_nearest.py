@@ -119,6 +119,12 @@ def match_descriptors(
     """Return matches by ratio test and mutual check, rising, and how distinct each is: 1 - nearest over second nearest.
 
     Each position of an image is in one match at most.
+
+    >>> values = np.random.default_rng(0).integers(0, 255, (30, 128)).astype(np.uint8)
+    >>> first = Descriptors(values=unit_descriptors(values), is_binary=False, first_index=np.arange(30))
+    >>> second = Descriptors(values=first.values[::-1], is_binary=False, first_index=np.arange(30))
+    >>> match_descriptors(first, second, 0.75)[0][:3].tolist()
+    [[0, 29], [1, 28], [2, 27]]
     """
     if min(len(first.values), len(second.values)) < 2:
         return np.zeros((0, 2), np.int64), np.zeros(0)

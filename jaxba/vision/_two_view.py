@@ -15,8 +15,8 @@ d is 2 for a homography and 3 for an epipolar geometry; k is 8 and 5 (essential)
 Planes. Matches that keep to the epipolar lines and lie off the plane by up to 20 thresholds are trees and roofs, 4 to
 7% of the inliers on flat nadir surveys, and tell most of heights: they stay. A homography decomposes to two poses that
 differ by some 10 degrees and fit points of the plane alike (Ma et al. 2004, "An invitation to 3-D vision", 5.3): of
-those that explain nine tenths of the inliers of the best, the one nearest to the attitudes is taken where they tell. Attitudes
-that are far from all of them, as of photos stored upside down, are not believed.
+those that explain nine tenths of the inliers of the best, the one nearest to the attitudes is taken where they tell.
+Attitudes that are far from all of them, as of photos stored upside down, are not believed.
 
 Cost: about 5 ms a pair of some hundred matches.
 """
@@ -100,6 +100,14 @@ def verify(
 
     Matches that lie at the same pixel of both images are none of the scene's: a watermark, dust on the sensor, the
     aircraft's own gear. They are outliers. Fewer than `min_inliers` inliers of the rest count as none.
+
+    >>> rng = np.random.default_rng(0)
+    >>> points = rng.uniform([-3, -3, 8], [3, 3, 12], (50, 3))
+    >>> camera = Pinhole(width_px=1000, height_px=1000, focal_px=1000.0)
+    >>> first, second = (p[:, :2] / p[:, 2:] * 1000 + 500 for p in (points, points - [1.0, 0, 0]))
+    >>> found = verify(first, second, camera, camera, threshold_px=1.0)
+    >>> int(found.is_inlier.sum()), (found.direction + 0).round(3).tolist()
+    (50, [-1.0, 0.0, 0.0])
     """
     moved = np.linalg.norm(first_px - second_px, axis=1) > 1.0
     x, y = first_px[moved], second_px[moved]

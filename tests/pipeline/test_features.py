@@ -1,0 +1,53 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxba import JaxbaError
+from jaxba.pipeline import features
+from jaxba.scene import Photo
+
+
+def photo_of(path: Path, width_px: int, height_px: int) -> Photo:
+    return Photo(name=path.name, path=path, sha256="", width_px=width_px, height_px=height_px, camera="a")
+
+
+def test_real_frame_has_as_many_features_as_asked_for_all_over_it(data_dir: Path) -> None:
+    path = sorted((data_dir / "images" / "brighton").glob("*.JPG"))[0]
+    outputs = features.run(features.Inputs(photo=photo_of(path, 1600, 900)), features.Params(nfeatures=3000))
+    found = outputs.features
+    assert found.num_keypoints == 3000 and found.descriptors.shape == (3000, 128)
+    assert found.coverage > 0.8
+    assert np.all((found.xy_px > 0) & (found.xy_px < [1600, 900]))
+
+
+def test_black_frame_has_zero_features(tmp_path: Path) -> None:
+    path = tmp_path / "black.jpg"
+    Image.new("RGB", (320, 240)).save(path)
+    found = features.run(features.Inputs(photo=photo_of(path, 320, 240)), features.Params()).features
+    assert found.num_keypoints == 0 and "no texture" in found.notes[0]
+
+
+def test_frame_of_another_size_than_its_tags_were_read_of_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "resized.jpg"
+    Image.new("RGB", (320, 240)).save(path)
+    with pytest.raises(JaxbaError, match=r"resized\.jpg has 320 x 240 pixels, and had 640 x 480 before"):
+        features.run(features.Inputs(photo=photo_of(path, 640, 480)), features.Params())
+
+
+def test_truncated_frame_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "cut.jpg"
+    Image.effect_noise((320, 240), 50).save(path)
+    path.write_bytes(path.read_bytes()[:8000])
+    with pytest.raises(JaxbaError, match=r"cut\.jpg cannot be decoded"):
+        features.run(features.Inputs(photo=photo_of(path, 320, 240)), features.Params())
+
+
+@pytest.mark.parametrize("module", ["features", "match"])
+def test_worker_that_imports_the_stage_loads_no_jax(module: str) -> None:
+    code = f"import sys, jaxba.pipeline.{module}; print(sorted({{'jax', 'optimistix', 'pandas'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,141 @@
+from dataclasses import fields
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial import KDTree
+
+from jaxba import JaxbaError
+from jaxba.scene import Features
+from jaxba.vision import Pixels, detect_features, grid_coverage
+
+
+def pixels_of(gray: np.ndarray) -> Pixels:
+    return Pixels(gray=gray, rgb=np.repeat(gray[:, :, None], 3, axis=2))
+
+
+def texture(height: int = 300, width: int = 400, contrast: float = 1.0, mean: float = 128.0) -> np.ndarray:
+    """Return smooth noise of several wavelengths."""
+    rng = np.random.default_rng(1)
+    waves = sum(s * cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), s) for s in (1.0, 2.0, 4.0, 8.0))
+    return np.clip(mean + contrast * 60 * waves, 0, 255).astype(np.uint8)  # pyright: ignore
+
+
+@pytest.mark.parametrize("sigma_px", [1.5, 3.0, 5.0, 9.0])
+def test_blob_is_found_where_it_was_rendered(sigma_px: float) -> None:
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:240, :200] + 0.5  # centres of pixels
+    errors = []
+    for center in np.array([100.3, 120.7]) + rng.uniform(-4, 4, (12, 2)):
+        blob = 40 + 180 * np.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / (2 * sigma_px**2))
+        found = detect_features(pixels_of(np.rint(blob).astype(np.uint8))).xy_px
+        errors.append(found[np.argmin(np.linalg.norm(found - center, axis=1))] - center)
+    assert np.abs(errors).max() < 0.1
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.02
+
+
+@pytest.mark.parametrize("detector", ["sift", "orb"])
+def test_half_turn_of_the_image_turns_the_keypoints(detector: str) -> None:
+    gray = texture(301, 405)  # a size that no scale divides
+    upright = detect_features(pixels_of(gray), detector=detector)
+    turned = detect_features(pixels_of(np.ascontiguousarray(gray[::-1, ::-1])), detector=detector)
+    back = np.array([405, 301]) - turned.xy_px
+    distance, nearest = map(np.asarray, KDTree(back).query(upright.xy_px))
+    pairs = distance < 1.0
+    assert pairs.mean() > 0.9
+    # a wrong half pixel would show as twice its size, and grow with the scale
+    size_px = upright.size_px[pairs]
+    for half in (size_px <= np.quantile(size_px, 0.8), size_px > np.quantile(size_px, 0.8)):
+        offset = (upright.xy_px[pairs] - back[nearest[pairs]])[half]
+        assert np.abs(np.median(offset, axis=0)).max() < 0.02
+
+
+def test_keypoints_lie_where_colmap_finds_them() -> None:
+    gray = texture()
+    ours = detect_features(pixels_of(gray)).xy_px
+    colmap = pycolmap.FeatureExtractor.create(device=pycolmap.Device.cpu)
+    theirs = np.array([(k.x, k.y) for k in colmap.extract_from_uint8_array(gray)[0]])  # the same convention of pixels
+    distance, nearest = map(np.asarray, KDTree(theirs).query(ours))
+    close = distance < 0.5
+    assert close.mean() > 0.7
+    assert np.abs(np.median(ours[close] - theirs[nearest[close]], axis=0)).max() < 0.02
+
+
+@pytest.mark.parametrize(("detector", "length"), [("sift", 128), ("orb", 32)])
+def test_frame_without_texture_has_zero_features_and_says_so(detector: str, length: int) -> None:
+    for value in (0, 255):
+        features = detect_features(pixels_of(np.full((200, 300), value, np.uint8)), detector=detector)
+        assert features.num_keypoints == 0
+        assert features.descriptors.shape == (0, length) and features.rgb.shape == (0, 3)
+        assert features.coverage == 0 and features.mean_brightness == value
+        assert "no texture" in features.notes[0]
+
+
+def test_descriptors_are_opencvs_without_loss() -> None:
+    gray = texture()
+    features = detect_features(pixels_of(gray), contrast_threshold=0.04)
+    sift = cv2.SIFT.create(nfeatures=8000, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(gray, None)  # pyright: ignore
+    assert len(keypoints) == features.num_keypoints > 500
+    theirs = np.array([(k.pt[0] + 0.5, k.pt[1] + 0.5, np.deg2rad(k.angle)) for k in keypoints])
+    distance, row = map(np.asarray, KDTree(theirs).query(np.column_stack([features.xy_px, features.angle_rad])))
+    assert distance.max() < 1e-6
+    assert np.array_equal(descriptors[row], features.descriptors)
+    assert features.descriptors.dtype == np.uint8 and features.descriptors.flags.c_contiguous
+
+
+def test_features_come_in_order_of_strength() -> None:
+    pixels = pixels_of(texture(450, 600))
+    many = detect_features(pixels, contrast_threshold=0.03)
+    few = detect_features(pixels, contrast_threshold=0.03, nfeatures=2000)
+    assert many.num_keypoints > 2500 and few.num_keypoints == 2000
+    same = np.mean([np.array_equal(a, b) for a, b in zip(many.xy_px[:2000], few.xy_px, strict=True)])
+    assert same > 0.99  # the last may be one of several equally strong
+
+
+def test_detection_is_deterministic() -> None:
+    for detector in ("sift", "orb"):
+        one, two = (detect_features(pixels_of(texture()), detector=detector) for _ in range(2))
+        for field in fields(Features):
+            assert np.array_equal(getattr(one, field.name), getattr(two, field.name))
+
+
+def test_low_light_lowers_the_contrast_threshold() -> None:
+    dark = pixels_of(texture(450, 600, contrast=0.35, mean=60))
+    at = {c: detect_features(dark, nfeatures=3000, contrast_threshold=c).num_keypoints for c in (0.03, 0.04)}
+    features = detect_features(dark, nfeatures=3000)
+    assert 200 < at[0.04] < at[0.03] == features.num_keypoints
+    assert "low light" in features.notes[-1]
+    bright = pixels_of(texture(450, 600, contrast=0.35, mean=140))
+    assert detect_features(bright, nfeatures=3000).num_keypoints == 1500  # half of the most
+
+
+def test_smooth_ground_keeps_its_strongest_features_and_says_so() -> None:
+    smooth = pixels_of(texture(450, 600, contrast=0.35, mean=140))
+    strict = detect_features(smooth, nfeatures=4000, contrast_threshold=0.04).num_keypoints
+    features = detect_features(smooth, nfeatures=4000)
+    assert strict < features.num_keypoints == 2000
+    assert f"only {strict} keypoints reach the contrast threshold 0.04; 2000 were kept" in features.notes[0]
+
+
+def test_colours_are_those_under_the_keypoints() -> None:
+    gray = texture()
+    rgb = np.dstack([gray, 255 - gray, np.full_like(gray, 7)])
+    features = detect_features(Pixels(gray=gray, rgb=rgb))
+    column, row = features.xy_px.astype(int).T
+    assert np.array_equal(features.rgb[:, 0], gray[row, column])
+    assert np.array_equal(features.rgb[:, 1], 255 - gray[row, column])
+
+
+def test_coverage_counts_the_cells_of_an_8_by_8_grid() -> None:
+    half = detect_features(pixels_of(np.hstack([texture(), np.full((300, 400), 128, np.uint8)])))
+    assert 0.45 < half.coverage < 0.6
+    assert grid_coverage(np.zeros((0, 2)), 100, 100) == 0
+    assert grid_coverage(np.array([[100.0, 100.0], [0.0, 0.0]]), 100, 100) == 2 / 64
+
+
+@pytest.mark.skipif(hasattr(cv2, "AKAZE_create"), reason="this OpenCV has AKAZE")
+def test_akaze_that_opencv_lacks_is_an_error_with_a_way_out() -> None:
+    with pytest.raises(JaxbaError, match=r"detector akaze: OpenCV .* take sift or orb"):
+        detect_features(pixels_of(texture()), detector="akaze")

@@ -117,7 +117,8 @@ def _match(done: Done) -> list[PhotoItem]:
             features=done.features.only(images),
         )
         shapes = [(done.photos[i].focal_px, done.photos[i].width_px, done.photos[i].height_px) for i in images]
-        placed = reference.xyz_m[images], reference.quaternion[images], reference.is_used[images]
+        columns = ("xyz_m", "std_m", "quaternion", "attitude_std_rad", "is_used")
+        placed = [getattr(reference, column)[images] for column in columns]
         items.append(PhotoItem(photo.name, inputs, (images, overlap, shapes, placed, inputs.features), 1.0))
     return items
 

@@ -20,12 +20,12 @@ class Params(Parameters):
     """What the user may set."""
 
     detector: str = parameter("sift", choices=("sift", "orb", "akaze"), help="kind of features")
-    nfeatures: int = parameter(8000, low=2000, high=20000, help="the most features an image")
+    nfeatures: int = parameter(8000, low=2000, high=20000, help="the most keypoints an image")
     contrast_threshold: float | None = parameter(
         None,
         low=0.02,
         high=0.08,
-        help="SIFT: weaker extrema are dropped; none: 0.04, 0.03 in low light, the best half down to 0.02",
+        help="SIFT: weaker extrema are dropped; none: 0.04, 0.03 in low light, 0.02 where these are too few",
     )
     edge_threshold: float = parameter(10.0, low=5, high=20, help="SIFT: 15 over crop rows, solar arrays, roof tiles")
     sigma: float = parameter(1.6, low=1.0, high=2.5, help="SIFT: blur of the first octave, px")

@@ -11,7 +11,9 @@ Detector = Literal["sift", "orb", "akaze"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
-    """Keypoints of one image, in the order of falling strength, with descriptors in the same order.
+    """Keypoints of one image, the best first (SIFT: the largest, ORB: the strongest), descriptors in the same order.
+
+    A SIFT keypoint with several orientations stands there once for each.
 
     - `xy_px`: the centre of the first pixel is (0.5, 0.5). `size_px`: diameter. `angle_rad`: of the keypoint.
     - `descriptors`: C-contiguous; SIFT 128 integral values, ORB 32 bytes of bits.

@@ -22,20 +22,23 @@ if TYPE_CHECKING:
     from jaxba.io._opensfm import write_opensfm
     from jaxba.io._ply import write_ply
     from jaxba.io._problem import read_problem
+    from jaxba.io._read_colmap import ColmapModel, read_colmap_text
     from jaxba.io._schema import SCHEMA, schema_markdown
     from jaxba.io._sites import Sites, make_sites
     from jaxba.io._tile import read_tile, write_tile
 
 __all__ = [
-    "SCHEMA", "Cloud", "CrsText", "Geotag", "Geotags", "Sites", "make_sites", "match_geotags", "parse_geotags",
-    "read_bal", "read_problem", "read_tile", "refuse_same_file", "schema_markdown", "what_bal_cannot_hold",
-    "write_atomically", "write_bal", "write_colmap_binary", "write_colmap_text", "write_csv_cloud", "write_geojson",
-    "write_geopackage", "write_las", "write_opensfm", "write_ply", "write_tile",
+    "SCHEMA", "Cloud", "ColmapModel", "CrsText", "Geotag", "Geotags", "Sites", "make_sites", "match_geotags",
+    "parse_geotags", "read_bal", "read_colmap_text", "read_problem", "read_tile", "refuse_same_file",
+    "schema_markdown", "what_bal_cannot_hold", "write_atomically", "write_bal", "write_colmap_binary",
+    "write_colmap_text", "write_csv_cloud", "write_geojson", "write_geopackage", "write_las", "write_opensfm",
+    "write_ply", "write_tile",
 ]  # fmt: skip
 
 _MODULE_OF = {
     "SCHEMA": "jaxba.io._schema",
     "Cloud": "jaxba.io._cloud",
+    "ColmapModel": "jaxba.io._read_colmap",
     "CrsText": "jaxba.io._crs",
     "Geotag": "jaxba.io._geotags",
     "Geotags": "jaxba.io._geotags",
@@ -44,6 +47,7 @@ _MODULE_OF = {
     "match_geotags": "jaxba.io._geotag_match",
     "parse_geotags": "jaxba.io._geotags",
     "read_bal": "jaxba.io._bal",
+    "read_colmap_text": "jaxba.io._read_colmap",
     "read_problem": "jaxba.io._problem",
     "read_tile": "jaxba.io._tile",
     "schema_markdown": "jaxba.io._schema",

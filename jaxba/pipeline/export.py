@@ -1,11 +1,22 @@
-"""Stage export: the adjusted block in the target CRS, in the files that other programs read."""
+"""Stage export: the adjusted block in the target CRS, in the files that other programs read.
 
+Everything before is computed in the local frame; here each point takes the whole way into the target CRS, once.
+"""
+
+import dataclasses
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
 
 from jaxba.pipeline import adjust
 from jaxba.pipeline._parameters import Parameters
-from jaxba.scene import Photo, Reference
+from jaxba.scene import Block, LocalFrame, Photo, Reference
+
+_MEDIAN_OF_LENGTH = np.sqrt(2 * np.log(2))  # of a plane vector with two standard normal components
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,7 +26,7 @@ class Inputs:
     photos: tuple[Photo, ...]
     reference: Reference
     adjusted: adjust.Outputs
-    folder: Path
+    folder: Path = Path()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,5 +43,215 @@ class Outputs:
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
-    """Write the exports."""
-    raise NotImplementedError
+    """Write the exports.
+
+    Raises `JaxbaError` where a point cannot be had in the target CRS, or a file cannot be written.
+    """
+    from jaxba import io
+
+    adjusted, folder = inputs.adjusted, inputs.folder
+    block = adjusted.block
+    frame = inputs.reference.frame if block.is_georeferenced else None
+    crs = None if frame is None else _crs_text(frame)
+    photos = [inputs.photos[i] for i in block.image_index]
+    cloud = io.Cloud(
+        xyz=_in_crs(frame, block.points_m),
+        rgb=block.rgb,
+        point_id=np.arange(1, block.num_points + 1),
+        track_length=np.bincount(block.observation_point, minlength=block.num_points),
+        error_px=adjusted.point_error_px,
+        std_m=adjusted.point_std_m,
+    )
+    io.write_csv_cloud(folder / "cloud.csv", cloud, crs)
+    io.write_ply(folder / "cloud.ply", cloud, crs)
+    if frame is not None and crs is not None:
+        io.write_las(folder / "cloud.laz", cloud, crs)
+        _write_sites(inputs, frame, crs)
+    _write_colmap(folder / "colmap", block, photos, adjusted.point_error_px, frame, inputs.photos)
+    gnss = inputs.reference.xyz_m[block.image_index], inputs.reference.std_m[block.image_index]
+    io.write_opensfm(folder / "reconstruction.json", block, photos, frame, *gnss)
+    notes = [*_notes(inputs, frame), *_name_notes(photos), *_write_tile(inputs)]
+    _write(folder / "cloud.png", _picture(inputs, cloud, frame))
+    _write(folder / "README.txt", _readme(notes).encode())
+    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return Outputs(files=tuple(files), notes=tuple(notes))
+
+
+def _in_crs(frame: LocalFrame | None, xyz_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    from jaxba import geo
+
+    return np.asarray(xyz_m, float) if frame is None else geo.projected_from_local(frame, xyz_m)
+
+
+def _crs_text(frame: LocalFrame) -> Any:
+    from jaxba.io import CrsText
+
+    return CrsText(
+        text=frame.crs,
+        name=frame.crs_name,
+        unit=frame.unit,
+        height_unit=frame.height_unit,
+        height_note=frame.height_note,
+    )
+
+
+def _write_sites(inputs: Inputs, frame: LocalFrame, crs: Any) -> None:
+    """Write the cameras, also those that are measured but not registered."""
+    from jaxba import geo, io
+
+    adjusted = inputs.adjusted
+    sites = io.make_sites(
+        adjusted.block,
+        inputs.photos,
+        inputs.reference,
+        std_m=adjusted.position_std_m,
+        gnss_residual_m=adjusted.gnss_residual_m,
+        error_px=adjusted.error_px,
+    )
+    io.write_geopackage(inputs.folder / "cameras.gpkg", sites, _in_crs(frame, sites.xyz_m), crs)
+    geodetic = geo.geodetic_from_local(frame, sites.xyz_m)
+    heights = f"Heights are in the photos' own height system ({frame.height_datum}), metres."
+    io.write_geojson(inputs.folder / "cameras.geojson", sites, geodetic, description=heights)
+
+
+def _write_colmap(
+    folder: Path,
+    block: Block,
+    photos: list[Photo],
+    error_px: Float[np.ndarray, " points"],
+    frame: LocalFrame | None,
+    all_photos: tuple[Photo, ...],
+) -> None:
+    from jaxba import io
+
+    names = [photo.name for photo in photos]
+    sizes = _camera_sizes(block, all_photos)
+    io.write_colmap_binary(folder / "binary", block, names, sizes, error_px)
+    io.write_colmap_text(folder / "text", block, names, sizes, error_px)
+    world: dict[str, Any] = {"world": "arbitrary frame and scale"}
+    if frame is not None:
+        world = {"world": "local east, north, up in metres around the origin", "origin": dataclasses.asdict(frame)}
+    _write(folder / "frame.json", (json.dumps(world, indent=1) + "\n").encode())
+
+
+def _camera_sizes(block: Block, photos: tuple[Photo, ...]) -> Int[np.ndarray, "cameras 2"]:
+    """Return width and height of each camera's images."""
+    sizes = {photo.camera: (photo.width_px, photo.height_px) for photo in reversed(photos)}
+    for row, index in zip(block.camera_index, block.image_index, strict=True):
+        sizes[block.camera_names[row]] = photos[index].width_px, photos[index].height_px
+    return np.array([sizes[name] for name in block.camera_names], dtype=np.int64)
+
+
+def _write_tile(inputs: Inputs) -> list[str]:
+    """Write the block as a problem that `jaxba solve` takes; return what it leaves out."""
+    from jaxba.ba import PRIORS
+    from jaxba.io import write_tile
+    from jaxba.sfm import to_problem
+    from jaxba.sfm._adjust import position_scale
+
+    block = inputs.adjusted.block
+    problem = to_problem(
+        block,
+        inputs.reference,
+        inputs.photos,
+        std_px=inputs.adjusted.median_px / _MEDIAN_OF_LENGTH,
+        position_scale=position_scale(block, inputs.reference),
+    )
+    known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
+    left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]
+    write_tile(inputs.folder / "tile.npz", dataclasses.replace(problem, priors=known))
+    return [f"tile.npz leaves out the priors that its format has no arrays for: {', '.join(left)}."] if left else []
+
+
+def _picture(inputs: Inputs, cloud: Any, frame: LocalFrame | None) -> bytes:
+    from jaxba.report import Picture, draw_picture
+
+    block = inputs.adjusted.block
+    photos = [inputs.photos[i] for i in block.image_index]
+    order = range(len(photos))
+    if all(photo.time for photo in photos):
+        order = sorted(order, key=lambda k: (photos[k].time, photos[k].name))
+    unit = "" if frame is None else _short(frame.unit)
+    figures = f"{block.num_observations:,} observations, median error {inputs.adjusted.median_px:.2f} px"
+    return draw_picture(
+        Picture(
+            xyz=cloud.xyz,
+            rgb=cloud.rgb,
+            error_px=cloud.error_px,
+            camera_xyz=_in_crs(frame, block.centers_m)[list(order)],
+            title=f"{block.num_images} of {len(inputs.photos)} photos, {block.num_points:,} points",
+            subtitle=figures,
+            crs="arbitrary frame and scale" if frame is None else _named(frame),
+            unit=unit,
+            height_label="Z" if frame is None else f"height ({_short(frame.height_unit)}, {_above(frame)})",
+        )
+    )
+
+
+def _named(frame: LocalFrame) -> str:
+    return f"{frame.crs_name} ({frame.crs})" if frame.crs.startswith("EPSG:") else frame.crs_name
+
+
+def _above(frame: LocalFrame) -> str:
+    """Return in two words what heights in the CRS are above, as far as its name or the photos' datum tells."""
+    from pyproj import CRS
+
+    if CRS(frame.crs).is_compound:
+        return CRS(frame.crs).sub_crs_list[1].name
+    return {"mean_sea_level": "above mean sea level", "unknown": "datum unknown"}.get(
+        frame.height_datum, frame.height_datum
+    )
+
+
+def _short(unit: str) -> str:
+    return {"metre": "m", "US survey foot": "US ft", "foot": "ft"}.get(unit, unit)
+
+
+def _notes(inputs: Inputs, frame: LocalFrame | None) -> list[str]:
+    if frame is not None:
+        return [f"Coordinates are in {_named(frame)}, unit {frame.unit}. {frame.height_note}"]
+    why = "no photo has a position that can be used"
+    if inputs.reference.frame is not None:
+        why = "the block could not be placed by the photos' positions"
+    return [
+        f"No coordinates on earth: {why}. Clouds and cameras are in a frame and scale of their own, without an EPSG "
+        "code; cloud.laz, cameras.gpkg and cameras.geojson, which need a CRS, are left out. "
+        "Give positions with geo.txt."
+    ]
+
+
+def _name_notes(photos: list[Photo]) -> list[str]:
+    spaced = [photo.name for photo in photos if " " in photo.name]
+    if not spaced:
+        return []
+    return [
+        f"COLMAP's text ends a photo's name at a space: {len(spaced)} names have %20 for it in colmap/text, first "
+        f"{spaced[0]!r}; colmap/binary has them as they are."
+    ]
+
+
+def _readme(notes: list[str]) -> str:
+    return "\n\n".join(["Results of jaxba.", *notes, _FILES])
+
+
+_FILES = """\
+PointID of cloud.csv, point_id of cloud.ply and cloud.laz, POINT3D_ID of COLMAP and the point's key of OpenSfM are one
+number. Sigmas are along local east, north, up, in metres.
+
+cloud.csv, cloud.csv.json    points in the target CRS, and what the columns are
+cloud.ply                    the same in full doubles: load it with a global shift where the viewer has one
+cloud.laz                    the same as LAS 1.4 with the CRS in the header; numbers to a thousandth of the unit
+cloud.png                    the cloud from above
+cameras.gpkg                 the photos' places in the target CRS; registered or not, sigmas, GNSS residuals
+cameras.geojson              the same, longitude and latitude on WGS 84
+colmap/binary, colmap/text   the model for COLMAP; its world is local, as frame.json beside it says
+reconstruction.json          the model for OpenSfM; its world is the same local one
+tile.npz                     the adjustment problem: python -m jaxba solve tile.npz
+"""
+
+
+def _write(path: Path, content: bytes) -> None:
+    from jaxba.io import write_atomically
+
+    with write_atomically(path) as file:
+        file.write(content)

@@ -80,6 +80,13 @@ class Shape:
         return self.num_shared_cameras * self.num_refined + (3 if self.lever_arm else 0)
 
 
+_NOTHING = Shape(
+    num_images=0, num_points=0, num_rows=0, chunk_runs=0, num_cameras=0, refined=(), own_cameras=False, lever_arm=False,
+    any_fixed_pose=False, any_fixed_point=False, any_bound=False, num_pair_runs=0, num_blocks=0, linear_solver="dense",
+    panel_images=1, band_panels=0,
+)  # fmt: skip
+
+
 class Plan(eqx.Module):
     """Index arrays of a problem's structure; `shape` is static."""
 
@@ -102,8 +109,15 @@ class Plan(eqx.Module):
     shape: Shape = eqx.field(static=True)
 
 
-def make_plan(problem: Problem, *, linear_solver: LinearSolver = "auto") -> Plan:
-    """Return the plan of a problem, whose indices and `free` masks must be concrete (not traced)."""
+def make_plan(
+    problem: Problem, *, linear_solver: LinearSolver = "auto", like: Shape | None = None, spare: float = 0.0
+) -> Plan:
+    """Return the plan of a problem, whose indices and `free` masks must be concrete (not traced).
+
+    For a series of like problems, whose observations come and go, that shall share compiled code: `spare` leaves room
+    for this share of points, observations and pairs more, and `like`, the shape of an earlier plan of the series, gives
+    the least sizes and the linear solver. What outgrows it gets a shape of its own.
+    """
     image = np.asarray(problem.observations.image_index)
     point = np.asarray(problem.observations.point_index)
     free_pose, free_point = np.asarray(problem.free.poses), np.asarray(problem.free.points)
@@ -114,7 +128,11 @@ def make_plan(problem: Problem, *, linear_solver: LinearSolver = "auto") -> Plan
     coupled = free_point[point] & (free_pose[image] | own_cameras)
     image_order, bandwidth = _order_images(image[coupled], point[coupled], problem)
     solver, panel_images, band_panels = _choose_linear_solver(linear_solver, len(image_order), block, bandwidth)
-    num_images = bucket(problem.num_images + 1, multiple=panel_images)
+    if like is not None and like.block == block and band_panels <= like.band_panels:
+        solver, panel_images, band_panels = like.linear_solver, like.panel_images, like.band_panels
+    least = _NOTHING if like is None else like
+    num_images = max(bucket(problem.num_images + 1, multiple=panel_images), least.num_images)
+    num_images = -(-num_images // panel_images) * panel_images
 
     rank_of_image = np.empty(problem.num_images, np.int32)
     rank_of_image[image_order] = np.arange(problem.num_images, dtype=np.int32)
@@ -124,16 +142,18 @@ def make_plan(problem: Problem, *, linear_solver: LinearSolver = "auto") -> Plan
     point_order = np.argsort(first_seen, kind="stable").astype(np.int32)
     rank_of_point = np.empty(problem.num_points, np.int32)
     rank_of_point[point_order] = np.arange(problem.num_points, dtype=np.int32)
-    num_points = bucket(problem.num_points + 1)
+    num_points = max(bucket(_more(problem.num_points, spare) + 1), least.num_points)
 
-    row_observation, row_image = _layout_rows(rank, rank_of_point[point], problem.num_images, num_images - 1)
+    row_observation, row_image = _layout_rows(
+        rank, rank_of_point[point], problem.num_images, num_images - 1, least.num_rows, spare
+    )
     num_rows = len(row_observation)
     row_point = np.where(row_observation >= 0, rank_of_point[point[row_observation]], num_points - 1).astype(np.int32)
 
     use = (row_observation >= 0) & coupled[row_observation]
     first, second, blocks_of_pairs = _pairs(row_image, row_point, np.flatnonzero(use), num_images)
-    runs = _pair_runs(first, second, blocks_of_pairs, num_rows - 1)
-    num_blocks = bucket(len(runs.blocks)) if len(runs.blocks) else 0
+    runs = _pair_runs(first, second, blocks_of_pairs, num_rows - 1, least.num_pair_runs, spare)
+    num_blocks = max(bucket(_more(len(runs.blocks), spare)) if len(runs.blocks) else 0, least.num_blocks)
     blocks = np.full(num_blocks, num_images * num_images - 1, np.int64)
     blocks[: len(runs.blocks)] = runs.blocks
 
@@ -146,8 +166,8 @@ def make_plan(problem: Problem, *, linear_solver: LinearSolver = "auto") -> Plan
         refined=tuple(bool(r) for r in refined),
         own_cameras=own_cameras,
         lever_arm=bool(problem.free.lever_arm),
-        any_fixed_pose=not free_pose.all(),
-        any_fixed_point=not free_point.all(),
+        any_fixed_pose=not free_pose.all() or least.any_fixed_pose,
+        any_fixed_point=not free_point.all() or least.any_fixed_point,
         any_bound=_any_bound(problem),
         num_pair_runs=len(runs.block_of_run),
         num_blocks=num_blocks,
@@ -176,6 +196,10 @@ def bucket(count: int, *, multiple: int = 1) -> int:
     step = max(1 << max(count.bit_length() - 4, 0), 1)
     rounded = -(-count // step) * step
     return -(-rounded // multiple) * multiple
+
+
+def _more(count: int, spare: float) -> int:
+    return int(count * (1 + spare))
 
 
 def _own_cameras(problem: Problem) -> bool:
@@ -251,15 +275,21 @@ _BAND_BYTES = 2e9
 
 
 def _layout_rows(
-    rank: Int[np.ndarray, " n"], point: Int[np.ndarray, " n"], num_images: int, padding_image: int
+    rank: Int[np.ndarray, " n"],
+    point: Int[np.ndarray, " n"],
+    num_images: int,
+    padding_image: int,
+    least_rows: int,
+    spare: float,
 ) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " rows"]]:
     """Sort observations by image, then point, and pad each image's to whole runs."""
     order = np.lexsort((point, rank))
     counts = np.bincount(rank, minlength=num_images)
     padded = -(-counts // ROW_RUN) * ROW_RUN
     starts = np.concatenate([[0], np.cumsum(padded)])
-    chunk = CHUNK_RUNS * ROW_RUN if starts[-1] >= CHUNK_RUNS * ROW_RUN else ROW_RUN
-    num_rows = bucket(int(starts[-1]) + 1, multiple=chunk)  # the last row is padding, and pads the pairs
+    wanted = max(_more(int(starts[-1]), spare) + 1, least_rows)  # the last row is padding, and pads the pairs
+    chunk = CHUNK_RUNS * ROW_RUN if wanted > CHUNK_RUNS * ROW_RUN else ROW_RUN
+    num_rows = bucket(wanted, multiple=chunk)
     row_observation = np.full(num_rows, -1, np.int32)
     within = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
     row_observation[np.repeat(starts[:-1], counts) + within] = order
@@ -305,14 +335,19 @@ class _PairRuns:
 
 
 def _pair_runs(
-    first: Int[np.ndarray, " pairs"], second: Int[np.ndarray, " pairs"], block: Int[np.ndarray, " pairs"], padding: int
+    first: Int[np.ndarray, " pairs"],
+    second: Int[np.ndarray, " pairs"],
+    block: Int[np.ndarray, " pairs"],
+    padding: int,
+    least_runs: int,
+    spare: float,
 ) -> _PairRuns:
     """Cut the pairs of each block into runs, padded with a row of zeros."""
     new_block = np.flatnonzero(np.diff(block, prepend=-1))
     counts = np.diff(new_block, append=len(block))
     runs = -(-counts // PAIR_RUN)
     starts = np.concatenate([[0], np.cumsum(runs)])
-    num_runs = bucket(int(starts[-1]), multiple=PAIR_CHUNK) if len(block) else 0
+    num_runs = max(bucket(_more(int(starts[-1]), spare), multiple=PAIR_CHUNK) if len(block) else 0, least_runs)
     shape = (num_runs, PAIR_RUN)
     of_pair = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(len(block)) - new_block[of_pair] if len(block) else np.zeros(0, np.int64)

@@ -35,9 +35,16 @@ def project(
     problem: Problem, point_in_cam: Float[np.ndarray, "3 rows"], observation: Int[np.ndarray, " rows"] | slice
 ) -> Float[np.ndarray, "2 rows"]:
     """Return the pixels of points in the cameras of these observations; not finite where the model has none."""
-    cameras, count = problem.cameras, point_in_cam.shape[1]
-    fields = [np.asarray(getattr(cameras, name), float) for name in cameras.parameter_names()]
     camera = np.asarray(problem.camera_index)[np.asarray(problem.observations.image_index)[observation]]
+    return project_in_cameras(problem.cameras, camera, point_in_cam)
+
+
+def project_in_cameras(
+    cameras: AbstractCamera, camera: Int[np.ndarray, " rows"], point_in_cam: Float[np.ndarray, "3 rows"]
+) -> Float[np.ndarray, "2 rows"]:
+    """Return the pixels of points, each in one of a batch of cameras; not finite where the model has none."""
+    count = point_in_cam.shape[1]
+    fields = [np.atleast_1d(np.asarray(getattr(cameras, name), float)) for name in cameras.parameter_names()]
     xy_px = np.empty((2, count))
     with jax.enable_x64(True):
         for start in range(0, count, _CHUNK):

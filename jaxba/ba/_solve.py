@@ -65,7 +65,8 @@ def solve(
     - `linear_solver`: how the reduced system is solved; `auto` chooses from its size and bandwidth.
     - `max_nfev`: the most steps tried. `ftol`, `xtol`, `gtol`: stop when the cost, the unknowns or the gradient no
       longer change, as in scipy.
-    - `plan`: the problem's structure, made by `make_plan`; needed where the problem's values are traced.
+    - `plan`: the problem's structure, made by `make_plan`; needed where the problem's values are traced. Where
+      something is left out of the problem, a new plan of the same sizes takes its place.
     - `callback`: called after every step.
 
     Raises `JaxbaError` for a problem that cannot be solved, naming what is wrong. What is left out instead (points seen
@@ -106,7 +107,8 @@ def _solve_on_host(
     begin = time.perf_counter()
     prepared = prepare(problem)
     if plan is None or prepared.dropped.any():
-        plan = make_plan(prepared.problem, linear_solver=linear_solver)
+        like = None if plan is None else plan.shape
+        plan = make_plan(prepared.problem, linear_solver=linear_solver, like=like)
     system: System = jax.device_put(make_system(prepared.problem, plan, loss, dtype))
     plain: System = jax.device_put(_without_losses(system))
     unknowns: Unknowns = jax.device_put(initial_unknowns(prepared.problem, plan, dtype))

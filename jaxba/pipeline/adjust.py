@@ -1,6 +1,6 @@
 """Stage adjust: the bundle adjustment in rounds, with rejection, pruning of edges and triangulation anew."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float
@@ -35,6 +35,8 @@ class Params(Parameters):
     xtol: float = parameter(1e-8, low=1e-12, high=1e-6, help="stop when the unknowns change by less than this share")
     track_threshold: float = parameter(2.0, low=1, high=4, help="acceptance of a triangulated track, px")
     mad_factor: float = parameter(2.5, low=2, high=5, help="reject over median + factor x MAD")
+    min_angle: float = parameter(1.5, low=0.1, high=10, help="least angle between two rays of a point, degrees")
+    max_rounds: int = parameter(5, low=1, high=20, help="the most rounds of solving, rejection and triangulation")
     edge_median_limit: float = parameter(3.0, low=2, high=6, help="edges of the view graph over it are pruned, px")
 
 
@@ -47,6 +49,7 @@ class Outputs:
     - `position_std_m`: sigma of each registered image's position, east, north, up; NaN where it was not computed.
     - `point_std_m`: sigma of each point; NaN likewise.
     - `intrinsics_std`: sigma of each intrinsic.
+    - `gnss_residual_m`: adjusted minus measured position; NaN where none was used.
     - `median_px`, `inlier_rate`, `variance_factor`, `num_rejected`, `rounds`: figures of the adjustment.
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
     - `findings`: what a surveyor should know, in sentences: ambiguities, contradictions, bounds reached.
@@ -70,5 +73,35 @@ class Outputs:
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
-    """Adjust the block."""
-    raise NotImplementedError
+    """Adjust the block.
+
+    Raises `JaxbaError` where it has fewer than two images, or no point of it is left.
+    """
+    from jaxba.sfm import Settings, adjust, findings, gnss_fit, uncertainty  # loads jax, which `--help` must not
+
+    options = {field.name: getattr(params, field.name) for field in fields(params) if field.name != "min_angle"}
+    settings = Settings(min_angle_rad=float(np.deg2rad(params.min_angle)), **options)
+    reference, photos = inputs.reference, inputs.photos
+    adjusted = adjust(inputs.block, inputs.tracks, inputs.view_graph, reference, photos, settings)
+    sigmas = uncertainty(adjusted, reference)
+    block = adjusted.block
+    fit = gnss_fit(block, reference)
+    found = findings(adjusted, inputs.block, sigmas, fit, reference, photos)
+    total = np.bincount(block.observation_point, adjusted.error_px, minlength=block.num_points)
+    return Outputs(
+        block=block,
+        error_px=adjusted.error_px,
+        point_error_px=total / np.bincount(block.observation_point, minlength=block.num_points),
+        position_std_m=sigmas.position_std_m,
+        point_std_m=sigmas.point_std_m,
+        intrinsics_std=sigmas.intrinsics_std,
+        gnss_residual_m=fit.residual_m,
+        gnss_rms_m=fit.rms_m,
+        num_gnss=fit.num,
+        median_px=adjusted.medians_px[-1],
+        inlier_rate=block.num_observations / adjusted.num_judged,
+        variance_factor=sigmas.variance_factor,
+        num_rejected=adjusted.num_rejected,
+        rounds=len(adjusted.medians_px),
+        findings=found,
+    )

@@ -38,6 +38,10 @@ class Descriptors:
     is_binary: bool
     first_index: Int[np.ndarray, " rows"]
 
+    def take(self, rows: Int[np.ndarray, " some"]) -> "Descriptors":
+        """Return some of them; matches still name features by their place among all."""
+        return Descriptors(values=self.values[rows], is_binary=self.is_binary, first_index=self.first_index[rows])
+
 
 def unit_descriptors(descriptors: UInt8[np.ndarray, "rows length"]) -> Float[np.ndarray, "rows length"]:
     """Return the square roots of SIFT descriptors that sum to 1, float32 of unit length.

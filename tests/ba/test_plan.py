@@ -1,5 +1,6 @@
 """The plan holds every pair of observations once, pads with what weighs nothing, and loses nothing on the way."""
 
+import dataclasses
 import itertools
 from collections import Counter
 
@@ -10,7 +11,8 @@ import pytest
 from dense_reference import start_of
 from small_problems import EVERY_CAMERA, small_problem
 
-from jaxba.ba import Problem
+import jaxba
+from jaxba.ba import Observations, Problem
 from jaxba.ba._plan import ROW_RUN, bucket, make_plan
 from jaxba.ba._system import initial_unknowns, make_system, restore
 from jaxba.geometry import Linear
@@ -111,3 +113,18 @@ def test_bucket_adds_at_most_an_eighth_and_has_eight_sizes_an_octave():
     assert all(bucket(bucket(count)) == bucket(count) for count in counts)
     assert bucket(100, multiple=7) % 7 == 0
     assert bucket(100, multiple=7) >= 100
+
+
+def test_plans_of_a_series_share_one_shape() -> None:
+    problem = jaxba.synthetic.uav_block(12, seed=2).problem
+    seen = problem.observations
+    few = np.sort(np.random.default_rng(0).permutation(problem.num_observations)[: int(0.7 * problem.num_observations)])
+    part = Observations(*(np.asarray(column)[few] for column in (
+        seen.xy_px, seen.std_px, seen.image_index, seen.point_index)))  # fmt: skip
+    smaller = dataclasses.replace(problem, observations=part)
+    whole = make_plan(problem, spare=0.2)
+    plan = make_plan(smaller, like=whole.shape)
+    assert plan.shape == whole.shape != make_plan(smaller).shape
+    same, own = jaxba.solve(smaller, plan=plan), jaxba.solve(smaller)
+    np.testing.assert_allclose(same.final_cost, own.final_cost, rtol=1e-9)
+    np.testing.assert_allclose(same.points, own.points, atol=1e-5)  # metres; sums in another order

@@ -1,0 +1,316 @@
+"""Findings: what a surveyor should know of an adjusted block, each a sentence or two with figures and the cure."""
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxba.geometry import CAMERAS
+from jaxba.scene import Block, Photo, Reference
+from jaxba.sfm._adjust import Adjusted
+from jaxba.sfm._problem import natural_intrinsics, used_positions
+from jaxba.sfm._uncertainty import Uncertainty
+
+_OUTLIER = 3.0  # sigmas
+_WEAK_OBSERVATIONS = 20
+_FOCAL_OFF = 0.05  # from the photos' focal length
+_CENTER_OFF = 0.03  # of the width
+_HEIGHT_SIGMA = 0.02  # of the height above ground, from the focal length's sigma
+_HEIGHT_OFF = 0.05  # adjusted against measured height above ground
+_NADIR = 0.97  # mean |cosine| between viewing directions and the vertical: 14 degrees
+_ONE_HEIGHT = 0.1  # spread of the flying height, as a share of it
+_DRIFT = 0.5  # share of the variance of height residuals that a trend explains
+
+
+@dataclasses.dataclass(frozen=True)
+class GnssFit:
+    """Adjusted minus measured positions.
+
+    - `residual_m`: of every registered image, NaN where nothing was measured or not used.
+    - `is_outlier`: beyond three robust sigmas. `rms_m`: an axis over the `num` others; None without any.
+    - `scale`: robust sigma of the residuals, an axis, metres.
+    """
+
+    residual_m: Float[np.ndarray, "images 3"]
+    is_outlier: Bool[np.ndarray, " images"]
+    rms_m: tuple[float, float, float] | None
+    num: int
+    scale_m: Float[np.ndarray, "3"]
+
+
+def gnss_fit(block: Block, reference: Reference) -> GnssFit:
+    """Return how well the block fits its measured positions.
+
+    An outlier's residual is over three sigmas in some axis, where sigma is the larger of the position's own and the
+    residuals' robust one (1.4826 MAD about zero).
+    """
+    used = used_positions(block, reference)
+    index = block.image_index
+    known = used[:, None] & np.isfinite(reference.std_m[index]) & np.isfinite(reference.xyz_m[index])
+    residual = np.where(known, block.centers_m - reference.xyz_m[index], np.nan)
+    scale = np.array(
+        [1.4826 * np.median(np.abs(r[k])) if k.any() else np.nan for r, k in zip(residual.T, known.T, strict=True)]
+    )
+    own = np.where(known, reference.std_m[index], np.nan)
+    # a plain receiver's sigma of metres is mostly a common offset: what scatters within a flight is judged by itself
+    limit = _OUTLIER * np.where(own > 1.0, np.maximum(scale, own / 3), np.maximum(scale, own))
+    with np.errstate(invalid="ignore"):
+        outlier = used & np.any(np.abs(residual) > limit, axis=1)
+    inlier = used & ~outlier
+    rms = None
+    if inlier.any():
+        with np.errstate(invalid="ignore"):
+            squared = [np.nanmean(c**2) if np.isfinite(c).any() else np.nan for c in residual[inlier].T]
+        east, north, up = (float(np.sqrt(s)) for s in squared)
+        rms = (east, north, up)
+    return GnssFit(residual, outlier, rms, int(inlier.sum()), scale)
+
+
+def findings(
+    adjusted: Adjusted, start: Block, sigmas: Uncertainty, fit: GnssFit, reference: Reference, photos: Sequence[Photo]
+) -> tuple[str, ...]:
+    """Return the findings on an adjusted block; `start` is the block before the adjustment."""
+    block = adjusted.block
+    return tuple(
+        [
+            *_convergence(adjusted),
+            *_edges(adjusted),
+            *_images(adjusted, photos),
+            *_outliers(block, fit, photos),
+            *_scatter(adjusted, reference, fit),
+            *_height_drift(block, reference),
+            *_no_heights(block, reference),
+            *_focal_and_height(block, sigmas, reference),
+            *_intrinsics(block, start, photos),
+            *_positions(block, sigmas, reference, photos),
+            *([sigmas.why_not] if sigmas.why_not else []),
+        ]
+    )
+
+
+def height_above_ground(block: Block) -> Float[np.ndarray, " images"]:
+    """Return the height of each camera over the median of its own points, metres; NaN where it has none."""
+    order = np.argsort(block.observation_image, kind="stable")
+    z = block.points_m[block.observation_point[order], 2]
+    image = block.observation_image[order]
+    bounds = np.searchsorted(image, np.arange(block.num_images + 1))
+    ground = [np.median(z[a:b]) if b > a else np.nan for a, b in pairwise(bounds)]
+    return block.centers_m[:, 2] - np.array(ground)
+
+
+def _convergence(adjusted: Adjusted) -> list[str]:
+    found, last_px = list(adjusted.notes), adjusted.medians_px[-1]
+    medians = ", ".join(f"{m:.2f}" for m in adjusted.medians_px)
+    if not adjusted.converged and len(adjusted.medians_px) > 2:
+        found.append(
+            f"The median error still changed after {len(adjusted.medians_px)} rounds ({medians} px); set "
+            "adjust.max_rounds higher, or look at the edges and images named here."
+        )
+    if not adjusted.solution.converged:
+        found.append(f"The last solve: {adjusted.solution.advice}")
+    if last_px > 3.0:
+        found.append(
+            f"The median error is {last_px:.1f} px: check the focal length against the sensor's "
+            "specification, and whether cameras or zooms are mixed."
+        )
+    return found
+
+
+def _edges(adjusted: Adjusted) -> list[str]:
+    return [f"Edge left out: {left.name}: {left.reason}." for left in adjusted.pruned]
+
+
+def _images(adjusted: Adjusted, photos: Sequence[Photo]) -> list[str]:
+    block = adjusted.block
+    found = [f"Image lost in the adjustment: {left.name}: {left.reason}." for left in adjusted.lost]
+    counts = np.bincount(block.observation_image, minlength=block.num_images)
+    weak = np.flatnonzero(counts < _WEAK_OBSERVATIONS)
+    if len(weak):
+        found.append(
+            f"{_many(len(weak), 'image')} with fewer than {_WEAK_OBSERVATIONS} points, so weakly placed: "
+            f"{_names(block, photos, weak, [f'{counts[i]} points' for i in weak])}. More overlap or features cure it."
+        )
+    return found
+
+
+def _outliers(block: Block, fit: GnssFit, photos: Sequence[Photo]) -> list[str]:
+    bad = np.flatnonzero(fit.is_outlier)
+    if not len(bad):
+        return []
+    bad = bad[np.argsort(-np.nan_to_num(np.abs(fit.residual_m[bad])).max(axis=1), kind="stable")]
+    figures = [", ".join(f"{r:+.1f}" if np.isfinite(r) else "none" for r in fit.residual_m[i]) + " m" for i in bad]
+    return [
+        f"{_many(len(bad), 'measured position')} of {fit.num + len(bad)} contradict the photos by more than "
+        f"{_OUTLIER:g} robust sigmas and hardly count (adjusted minus measured, east, north, up): "
+        f"{_names(block, photos, bad, figures)}."
+    ]
+
+
+def _scatter(adjusted: Adjusted, reference: Reference, fit: GnssFit) -> list[str]:
+    scale = adjusted.position_scale
+    if scale.max() < 1.5:
+        return []
+    index = adjusted.block.image_index[used_positions(adjusted.block, reference)]
+    stated = np.median(reference.std_m[index], axis=0)
+    text = ", ".join(
+        f"{axis} {s:.2g} m instead of {t:.2g} m"
+        for axis, s, t, k in zip(("east", "north", "up"), fit.scale_m, stated, scale, strict=True)
+        if k >= 1.5
+    )
+    return [
+        f"Measured positions scatter more than their sigmas say ({text}); the sigmas were enlarged to that. Check the "
+        "antenna's offset, the time between exposure and fix, and whether the receiver had its fixed solution."
+    ]
+
+
+def _height_drift(block: Block, reference: Reference) -> list[str]:
+    """Heights that wander in the order of the photos: a receiver that drifts, not noise."""
+    every = block.image_index
+    measured = np.isfinite(reference.xyz_m[every, 2]) & np.isfinite(reference.std_m[every, 2])
+    rows = np.flatnonzero(measured & block.is_georeferenced)
+    if len(rows) < 8:
+        return []
+    residual = block.centers_m[rows, 2] - reference.xyz_m[every[rows], 2]
+    time = np.linspace(-1, 1, len(rows))
+    slope, _ = np.polyfit(time, residual, 1)
+    share = 1 - np.var(residual - np.polyval(np.polyfit(time, residual, 1), time)) / max(np.var(residual), 1e-12)
+    limit = max(3 * float(np.median(reference.std_m[every[rows], 2])), 0.1)
+    if share < _DRIFT or 2 * abs(slope) < limit:
+        return []
+    return [
+        f"Measured heights drift against the photos by {2 * abs(slope):.1f} m from the first to the last photo, which "
+        f"explains {share:.0%} of their residuals: the receiver's altitude cannot be trusted. Leave heights out, or "
+        "use ground control."
+    ]
+
+
+def _no_heights(block: Block, reference: Reference) -> list[str]:
+    index = block.image_index[used_positions(block, reference)]
+    if not len(index) or np.isfinite(reference.std_m[index, 2]).any():
+        return []
+    return [
+        "No measured height is used, so the block's height and its tilt are those of the start values and not "
+        "measured: heights and slopes of the results are not to be relied on. Add ground control, or photos with "
+        "heights that can be trusted."
+    ]
+
+
+def _focal_and_height(block: Block, sigmas: Uncertainty, reference: Reference) -> list[str]:
+    """The focal length and the height above ground of a flat nadir block trade off: df / f = dh / h."""
+    if not block.is_georeferenced:
+        return []
+    names = CAMERAS[block.camera_model].parameter_names()
+    adjusted_m = height_above_ground(block)
+    measured_m = reference.height_above_ground_m[block.image_index]
+    height = float(np.nanmedian(adjusted_m))
+    if not height > 0:
+        return []
+    focal, sigma = block.camera_parameters[0, 0], sigmas.intrinsics_std[0, 0]
+    share = sigma / focal
+    both = np.isfinite(adjusted_m) & np.isfinite(measured_m)
+    found = []
+    contradicts = False
+    tie = ""
+    if both.any():
+        adjusted_median, measured_median = float(np.median(adjusted_m[both])), float(np.median(measured_m[both]))
+        ratio = adjusted_median / measured_median
+        contradicts = abs(ratio - 1) > _HEIGHT_OFF
+        tie = (
+            f"The cameras are {adjusted_median:.1f} m above the ground points by the adjustment and "
+            f"{measured_median:.1f} m above the take-off point by the flight's own record ({ratio - 1:+.0%})"
+        )
+    weak = np.isfinite(share) and share > _HEIGHT_SIGMA
+    if contradicts or weak:
+        cause = _geometry(block, adjusted_m)
+        text = (
+            f"Focal length and height trade off{cause}: {names[0]} is {focal:.1f} px with a sigma of "
+            f"{sigma:.1f} px ({share:.1%}), which alone makes the height above ground of {height:.1f} m uncertain by "
+            f"{share * height:.1f} m."
+        )
+        if contradicts:
+            text += (
+                f" {tie}; a focal length of {focal / ratio:.0f} px would agree with it, if the ground lies at the "
+                "height of the take-off point."
+            )
+        text += (
+            " Hold the focal length at a calibrated value (metadata.focal), fly a second height, add oblique photos, "
+            "or measure ground control."
+        )
+        found.append(text)
+    return found
+
+
+def _geometry(block: Block, height_m: Float[np.ndarray, " images"]) -> str:
+    x, y = block.quaternion[:, 1], block.quaternion[:, 2]
+    down = np.abs(1 - 2 * (x**2 + y**2))  # the viewing direction's vertical part
+    if np.mean(down) < _NADIR:
+        return ""
+    spread = np.ptp(np.percentile(block.centers_m[:, 2], [5, 95])) / max(float(np.nanmedian(height_m)), 1e-9)
+    return (
+        " (all photos look straight down from one height)" if spread < _ONE_HEIGHT else " (photos look straight down)"
+    )
+
+
+def _intrinsics(block: Block, start: Block, photos: Sequence[Photo]) -> list[str]:
+    natural = natural_intrinsics(start, photos)
+    names = CAMERAS[block.camera_model].parameter_names()
+    found = []
+    for c, label in enumerate(block.camera_names):
+        values = block.camera_parameters[c]
+        width = 2 * natural.center[c, names.index("cx")]
+        for k, name in enumerate(names):
+            low, high, value = natural.lower[c, k], natural.upper[c, k], values[k]
+            margin = 1e-3 * (high - low)
+            if value <= low + margin or value >= high - margin:
+                found.append(
+                    f"Camera {label}: {name} is at its bound ({value:.4g}, allowed {low:.4g} to {high:.4g}): the "
+                    "calibration takes up another error. Check the focal length and the camera model, add oblique "
+                    "photos or control, or hold it fixed."
+                )
+            elif name in ("f", "fx") and abs(value / natural.center[c, k] - 1) > _FOCAL_OFF:
+                found.append(
+                    f"Camera {label}: {name} moved from {natural.center[c, k]:.0f} to {value:.0f} px "
+                    f"({value / natural.center[c, k] - 1:+.1%}). Compare with the sensor's specification."
+                )
+            elif name in ("cx", "cy") and abs(value - natural.center[c, k]) > _CENTER_OFF * width:
+                found.append(
+                    f"Camera {label}: the principal point's {name} is {value - natural.center[c, k]:+.0f} px off the "
+                    "middle; in a block without cross strips it may stand for a tilt. Photos turned by 90 degrees tell."
+                )
+    return found
+
+
+def _positions(block: Block, sigmas: Uncertainty, reference: Reference, photos: Sequence[Photo]) -> list[str]:
+    std = sigmas.position_std_m
+    if not np.isfinite(std).any():
+        return []
+    found = []
+    largest = std.max(axis=1)
+    middle = float(np.median(largest))
+    weak = np.flatnonzero(largest > max(5 * middle, 0.02))
+    if len(weak):
+        found.append(
+            f"{_many(len(weak), 'image')} with a position sigma over five times the median of {middle:.2g} m: "
+            f"{_names(block, photos, weak, [f'{largest[i]:.2g} m' for i in weak])}."
+        )
+    used = used_positions(block, reference)
+    if used.any():
+        stated = np.median(reference.std_m[block.image_index[used]], axis=0)
+        if np.isfinite(stated[0]) and stated[0] > 1:
+            found.append(
+                f"Position sigmas (median {middle:.2g} m) are about the mean of all GNSS positions. Those of a single "
+                f"receiver have an offset in common, up to their own sigma of {stated[0]:.1f} m horizontally, which "
+                "is not in these: only control or a differential receiver removes it."
+            )
+    return found
+
+
+def _names(block: Block, photos: Sequence[Photo], rows: Int[np.ndarray, " rows"], figures: Sequence[str]) -> str:
+    shown = [f"{photos[int(block.image_index[i])].name} ({figure})" for i, figure in zip(rows, figures, strict=True)]
+    return ", ".join(shown[:10]) + (f" and {len(shown) - 10} more" if len(shown) > 10 else "")
+
+
+def _many(count: int, kind: str) -> str:
+    return f"{count} {kind}{'' if count == 1 else 's'}"

@@ -1,0 +1,244 @@
+"""From a block and what was measured beside it to an adjustment problem: priors, bounds, what is free.
+
+**Positions** are priors with a loss that lets a single bad fix go (`POSITION_LOSS`): at four sigmas a fix has a quarter
+of its weight left, at six a tenth. Sigmas are those of the reference times `position_scale`, for receivers whose
+positions scatter more than they claim.
+
+**Attitudes** of one flight err alike (a compass, a gimbal's zero), so that all of them together count as one
+measurement: each sigma is multiplied by the root of their number. They hold the block where positions cannot: a single
+flight line may roll about itself.
+
+**Cameras** have weak priors: what the photos tell of the focal length, the principal point in the middle within 1% of
+the width, pixels square, distortion small; and bounds. Parameters in `held` keep their value through a tight prior, not
+as fixed ones: so all rounds of an adjustment have one shape and compile once.
+
+**A block without a place on earth** is held by weak priors on all positions at its start values: the seven directions
+that photos cannot fix stay where they were, and nothing else is bent (sigma a tenth of the block's extent).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from jaxba.ba import AttitudePrior, IntrinsicsPrior, Observations, PositionPrior, Problem, Solution
+from jaxba.ba._problem import AbstractPrior
+from jaxba.geometry import CAMERAS, Cauchy, GemanMcClure, Linear, Pose
+from jaxba.scene import Block, Photo, Reference
+from jaxba.sfm._aspect import AspectPrior
+
+POSITION_LOSS = GemanMcClure(4.0)
+FOCAL_BOUNDS = (0.7, 1.4)
+BOUNDS = {"k1": 0.5, "k2": 0.5, "k3": 0.5, "k4": 0.5, "p1": 0.05, "p2": 0.05}
+_STD = {"k1": 0.2, "k2": 0.2, "k3": 0.2, "k4": 0.2, "p1": 0.01, "p2": 0.01}
+_FOCAL_STD = {"given": 0.02, "calibrated": 0.02, "focal_plane": 0.05, "sensor_table": 0.05, "equivalent_35mm": 0.07}
+_FOCAL_UNKNOWN_STD = 0.3
+_CENTER_STD, _CENTER_BOUND = 0.01, 0.1  # of the image's width
+_ASPECT_STD = 5e-4
+_HELD = 1e-6  # of a parameter's natural sigma
+_ATTITUDE_STD_RAD = 0.035  # at least: 2 degrees
+_START_ATTITUDE_STD_RAD = 0.5
+_ANCHOR = 0.1  # sigma of positions at their start values, of the block's extent
+_COLLINEAR = 0.03  # second over first extent of the positions
+_LEAST_IMAGES_ALL_FREE = 8
+
+
+def to_problem(
+    block: Block,
+    reference: Reference,
+    photos: Sequence[Photo],
+    *,
+    anchor: Block | None = None,
+    std_px: float = 1.0,
+    position_scale: Float[np.ndarray, "3"] | None = None,
+    held: Sequence[str] = (),
+) -> Problem:
+    """Return the problem of a block with points, its observations and all priors.
+
+    - `anchor`: the block as it started, which holds what nothing measured holds, and gives the focal length's start
+      where the photos give none; the block itself if None.
+    - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
+    - `held`: names of the camera model's parameters that stay as they are.
+
+    >>> import numpy as np
+    >>> from jaxba.sfm import free_parameters
+    >>> free_parameters("OPENCV", num_images=4)
+    ('fx', 'fy', 'k1')
+    """
+    anchor = block if anchor is None else anchor
+    model = CAMERAS[block.camera_model]
+    natural = natural_intrinsics(anchor, photos)
+    inside = np.clip(block.camera_parameters, natural.lower, natural.upper)
+    names = model.parameter_names()
+    priors: list[AbstractPrior] = [
+        *_position_priors(anchor, reference, position_scale),
+        *_attitude_priors(anchor, reference),
+        _intrinsics_prior(natural, inside, [name in held for name in names]),
+    ]
+    if names[:2] == ("fx", "fy"):
+        cameras = np.arange(len(inside), dtype=np.int32)
+        ones = np.ones(len(inside))
+        priors.append(AspectPrior(camera_index=cameras, ratio=ones, std=_ASPECT_STD * ones))
+    count = block.num_observations
+    problem = Problem.build(
+        Pose(block.quaternion, block.translation_m),
+        model.from_parameters(inside),
+        block.points_m,
+        Observations(
+            block.observation_xy_px,
+            np.full(count, float(std_px)),
+            block.observation_image.astype(np.int32),
+            block.observation_point.astype(np.int32),
+        ),
+        camera_index=block.camera_index.astype(np.int32),
+        priors=priors,
+        image_names=[photos[i].name for i in block.image_index],
+    )
+    if block.camera_model == "OPENCV":
+        problem = problem.fix(intrinsics=["k3"])
+    return dataclasses.replace(problem, lower=natural.lower, upper=natural.upper)
+
+
+def with_solution(block: Block, solution: Solution) -> Block:
+    """Return the block with the adjusted poses, cameras and points."""
+    names = type(solution.cameras).parameter_names()
+    return dataclasses.replace(
+        block,
+        quaternion=np.asarray(solution.poses.quaternion),
+        translation_m=np.asarray(solution.poses.translation),
+        camera_parameters=np.stack([np.asarray(getattr(solution.cameras, name)) for name in names], axis=1),
+        points_m=np.asarray(solution.points),
+    )
+
+
+def free_parameters(camera_model: str, *, num_images: int) -> tuple[str, ...]:
+    """Return the parameters that a block of so many images can calibrate: focal length and k1 only in a small one."""
+    names = CAMERAS[camera_model].parameter_names()
+    if num_images >= _LEAST_IMAGES_ALL_FREE:
+        return tuple(name for name in names if not (camera_model == "OPENCV" and name == "k3"))
+    return tuple(name for name in names if name in ("f", "fx", "fy", "k1"))
+
+
+@dataclasses.dataclass(frozen=True)
+class NaturalIntrinsics:
+    """What is known of the cameras beforehand, and their bounds; a row a camera."""
+
+    center: Float[np.ndarray, "cameras parameters"]
+    std: Float[np.ndarray, "cameras parameters"]
+    lower: Float[np.ndarray, "cameras parameters"]
+    upper: Float[np.ndarray, "cameras parameters"]
+
+
+def natural_intrinsics(block: Block, photos: Sequence[Photo]) -> NaturalIntrinsics:
+    """Return priors and bounds of the cameras of a block that has not been adjusted yet."""
+    names = CAMERAS[block.camera_model].parameter_names()
+    center, std = np.zeros(block.camera_parameters.shape), np.zeros(block.camera_parameters.shape)
+    lower, upper = np.zeros(center.shape), np.zeros(center.shape)
+    for c in range(len(center)):
+        members = [photos[i] for i in block.image_index[block.camera_index == c]] or list(photos[:1])
+        width, height = members[0].width_px, members[0].height_px
+        focal, share = _focal(members)
+        for k, name in enumerate(names):
+            if name in ("f", "fx", "fy"):
+                value = block.camera_parameters[c, k] if focal is None else focal
+                low, high = (factor * value for factor in FOCAL_BOUNDS)
+                row = value, share * value, low, high
+            elif name in ("cx", "cy"):
+                value = (width if name == "cx" else height) / 2
+                row = value, _CENTER_STD * width, value - _CENTER_BOUND * width, value + _CENTER_BOUND * width
+            else:
+                row = 0.0, _STD[name], -BOUNDS[name], BOUNDS[name]
+            center[c, k], std[c, k], lower[c, k], upper[c, k] = row
+    return NaturalIntrinsics(center, std, lower, upper)
+
+
+def used_positions(block: Block, reference: Reference) -> Bool[np.ndarray, " images"]:
+    """Return which of the block's images have a position that is a prior."""
+    index = block.image_index
+    measured = np.isfinite(reference.xyz_m[index]) & np.isfinite(reference.std_m[index])
+    return reference.is_used[index] & measured.any(axis=1) & block.is_georeferenced
+
+
+def is_collinear(positions_m: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether positions lie on a line, or are too few to tell."""
+    if len(positions_m) < 3:
+        return True
+    extent = np.linalg.svd(positions_m - positions_m.mean(axis=0), compute_uv=False)
+    return bool(extent[1] <= _COLLINEAR * extent[0])
+
+
+def _fix_attitude(reference: Reference, index: np.ndarray) -> bool:
+    """Whether positions fix a block's rotation: they lie on no line, and their heights are measured."""
+    full = index[np.isfinite(reference.std_m[index] + reference.xyz_m[index]).all(axis=1)]
+    return not is_collinear(reference.xyz_m[full])
+
+
+def _focal(members: Sequence[Photo]) -> tuple[float | None, float]:
+    """Return the focal length that the photos tell, and its sigma as a share."""
+    known = [(p.focal_px, p.focal_source) for p in members if p.focal_px is not None]
+    if not known:
+        return None, _FOCAL_UNKNOWN_STD
+    return float(np.median([focal for focal, _ in known])), _FOCAL_STD[known[0][1] or "equivalent_35mm"]
+
+
+def _intrinsics_prior(
+    natural: NaturalIntrinsics, values: Float[np.ndarray, "cameras parameters"], held: Sequence[bool]
+) -> IntrinsicsPrior:
+    std = np.where(held, _HELD * natural.std, natural.std)
+    return IntrinsicsPrior(
+        camera_index=np.arange(len(values), dtype=np.int32),
+        parameters=np.where(held, values, natural.center),
+        std=std,
+    )
+
+
+def _position_priors(
+    anchor: Block, reference: Reference, scale: Float[np.ndarray, "3"] | None
+) -> tuple[PositionPrior, ...]:
+    used = used_positions(anchor, reference)
+    extent = np.linalg.norm(anchor.centers_m - np.median(anchor.centers_m, axis=0), axis=1)
+    weak = _ANCHOR * max(float(np.sqrt(np.mean(extent**2))), 1e-6)
+    if used.sum() < 3:
+        xyz, std = anchor.centers_m, np.full((anchor.num_images, 3), weak)
+        if anchor.is_georeferenced:
+            measured = reference.xyz_m[anchor.image_index[used]]
+            xyz[used] = np.where(np.isfinite(measured), measured, xyz[used])
+            std[used] = _sigma(reference, anchor.image_index[used], scale)
+        every = np.arange(anchor.num_images, dtype=np.int32)
+        return (PositionPrior(image_index=every, xyz=xyz, std_m=std, loss=Linear()),)
+    rows = np.flatnonzero(used)
+    index = anchor.image_index[rows]
+    xyz, std = reference.xyz_m[index].copy(), _sigma(reference, index, scale)
+    nowhere = ~np.isfinite(std).any(axis=0)  # no photo has a height: they stay where they start
+    xyz[:, nowhere], std[:, nowhere] = anchor.centers_m[rows][:, nowhere], weak
+    priors = PositionPrior(image_index=rows.astype(np.int32), xyz=np.nan_to_num(xyz), std_m=std, loss=POSITION_LOSS)
+    return (priors,)
+
+
+def _sigma(reference: Reference, index: np.ndarray, scale: np.ndarray | None) -> Float[np.ndarray, "n 3"]:
+    """Return sigmas of positions, infinite where an axis is not measured."""
+    std = reference.std_m[index] * (1.0 if scale is None else scale)
+    return np.where(np.isfinite(reference.xyz_m[index]) & (std > 0), std, np.inf)
+
+
+def _attitude_priors(anchor: Block, reference: Reference) -> tuple[AttitudePrior, ...]:
+    """Measured attitudes; where there are none and positions do not tell them, weakly those at the start."""
+    if not anchor.is_georeferenced:
+        return ()
+    index = anchor.image_index
+    measured = np.isfinite(reference.quaternion[index]).all(axis=1)
+    if measured.any():
+        rows = np.flatnonzero(measured)
+        quaternion = reference.quaternion[index[rows]]
+        std = np.nan_to_num(reference.attitude_std_rad[index[rows]], nan=_ATTITUDE_STD_RAD)
+        std = np.maximum(std, _ATTITUDE_STD_RAD)
+    elif not _fix_attitude(reference, index[used_positions(anchor, reference)]):
+        rows = np.arange(anchor.num_images)
+        quaternion, std = anchor.quaternion, np.full((anchor.num_images, 3), _START_ATTITUDE_STD_RAD)
+    else:
+        return ()
+    unit = Rotation.from_quat(quaternion, scalar_first=True).as_quat(scalar_first=True)
+    std = std * np.sqrt(len(rows))
+    return (AttitudePrior(image_index=rows.astype(np.int32), quaternion=unit, std_rad=std, loss=Cauchy(3.0)),)

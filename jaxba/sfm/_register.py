@@ -1,0 +1,147 @@
+"""Which images have a pose that can be trusted: more of them, fewer of them, and the reasons for those without."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxba._errors import JaxbaError
+from jaxba.scene import Block, Left, Photo, Reference, Tracks
+from jaxba.sfm._points import with_points
+from jaxba.sfm._resection import resect
+from jaxba.sfm._rigid import rigid_whole
+from jaxba.sfm._start_cameras import StartCameras
+
+CONTRADICTION = 5.0  # sigmas
+MIN_INLIERS = 12  # with fewer points a wrong pose finds support by chance
+
+
+def register_more(
+    block: Block,
+    tracks: Tracks,
+    cameras: StartCameras,
+    component: Int[np.ndarray, " n"],
+    reasons: dict[int, str],
+    min_angle_rad: float,
+    max_error_px: float,
+) -> Block:
+    """Return the block with images added whose points fix their pose; `reasons` says it of the others."""
+    while True:
+        missing = np.setdiff1d(component, block.image_index)
+        found = [resect(block, tracks, int(i), int(cameras.of_image[i]), max_error_px, MIN_INLIERS) for i in missing]
+        good = [f for f in found if f.is_found]
+        for f in found:
+            if not f.is_found:
+                text = f"{f.num_inliers} of its {f.num_points} points agree on a pose, {MIN_INLIERS} are needed"
+                reasons.setdefault(f.image, text)
+        if not good:
+            return block
+        index = np.concatenate([block.image_index, [f.image for f in good]])
+        order = np.argsort(index)
+        block = dataclasses.replace(
+            block,
+            image_index=index[order],
+            quaternion=np.concatenate([block.quaternion, [f.quaternion for f in good]])[order],
+            translation_m=np.concatenate([block.translation_m, [f.translation_m for f in good]])[order],
+            camera_index=cameras.of_image[index[order]],
+        )
+        block = with_points(block, tracks, min_angle_rad=min_angle_rad, max_error_px=max_error_px)
+
+
+def drop_weak(
+    block: Block,
+    tracks: Tracks,
+    reference: Reference,
+    reasons: dict[int, str],
+    min_angle_rad: float,
+    max_error_px: float,
+    max_sigmas: float,
+) -> Block:
+    """Return the block without images that too few points hold, or that nothing ties to the rest.
+
+    Tied are images of the rigid whole, and those within `max_sigmas` of their trusted position.
+
+    Raises `JaxbaError` where fewer than two images are left.
+    """
+    while True:
+        count = np.bincount(block.observation_image, minlength=block.num_images)
+        tied, shared = rigid_whole(
+            block.observation_image, block.observation_point, block.num_images, least=MIN_INLIERS
+        )
+        few = count < MIN_INLIERS
+        off = sigmas_off(block, reference)
+        keep = ~few & (tied | (np.isfinite(off) & (off <= max_sigmas)))
+        if np.count_nonzero(keep) < 2:
+            raise JaxbaError(
+                f"start values failed: {block.num_points} points of {block.num_images} images fit their pixels, and no "
+                f"two images share {MIN_INLIERS} of them. A wrong focal length is the usual cause (camera "
+                f"{block.camera_names[0]}: {block.camera_parameters[0, 0]:.0f} px); check it, or set metadata.focal."
+            )
+        if keep.all():
+            return block
+        for row in np.flatnonzero(~keep):
+            reasons[int(block.image_index[row])] = (
+                f"{count[row]} points fit its pose, {MIN_INLIERS} are needed"
+                if few[row]
+                else f"{shared[row]} of its points are seen by two images of the rest, {MIN_INLIERS} are needed to "
+                "know how far off it is, and no trusted position tells it"
+            )
+        block = _select(block, keep)
+        block = with_points(block, tracks, min_angle_rad=min_angle_rad, max_error_px=max_error_px)
+
+
+def contradictions(block: Block, reference: Reference, photos: Sequence[Photo]) -> list[str]:
+    """Name positions that the images contradict; they stay, under a robust loss."""
+    index, sigmas = block.image_index, sigmas_off(block, reference)
+    use = np.isfinite(sigmas)
+    off = np.where(np.isfinite(reference.std_m[index]), block.centers_m - reference.xyz_m[index], 0.0)
+    bad = np.flatnonzero(use & (sigmas > CONTRADICTION))
+    if len(bad) == 0:
+        return []
+    bad = bad[np.argsort(-sigmas[bad], kind="stable")]
+    named = ", ".join(f"{photos[int(index[b])].name} ({np.linalg.norm(off[b]):.1f} m)" for b in bad[:5])
+    more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+    return [
+        f"{len(bad)} of {np.count_nonzero(use)} measured positions contradict the images by more than "
+        f"{CONTRADICTION:g} sigma: {named}{more}. They stay in the adjustment under a robust loss."
+    ]
+
+
+def unregistered(photos: Sequence[Photo], tracks: Tracks, block: Block, reasons: dict[int, str]) -> tuple[Left, ...]:
+    left = {}
+    registered = set(block.image_index.tolist())
+    for component in tracks.components:
+        for image in component:
+            if image in registered:
+                continue
+            if component is tracks.components[0]:
+                left[image] = f"{reasons.get(image, 'no pose was found')}; fly more overlap there."
+            elif len(component) == 1:
+                left[image] = "no edge of the view graph joins it with another photo; fly more overlap there."
+            else:
+                left[image] = (
+                    f"in a group of {len(component)} photos that no edge joins with the largest group of "
+                    f"{len(tracks.components[0])}; map it on its own, or fly the gap."
+                )
+    return tuple(Left(name=photos[i].name, reason=left[i]) for i in sorted(left))
+
+
+def sigmas_off(block: Block, reference: Reference) -> Float[np.ndarray, " images"]:
+    """Return by how many sigmas each image is off its trusted position, on the worst axis; infinite without one."""
+    index = block.image_index
+    known = reference.is_used[index] & block.is_georeferenced
+    with np.errstate(invalid="ignore"):
+        off = np.abs(block.centers_m - reference.xyz_m[index]) / reference.std_m[index]
+    off = np.where(np.isfinite(reference.std_m[index]), off, 0.0)
+    return np.where(known, off.max(axis=1), np.inf)
+
+
+def _select(block: Block, keep: Bool[np.ndarray, " images"]) -> Block:
+    return dataclasses.replace(
+        block,
+        image_index=block.image_index[keep],
+        quaternion=block.quaternion[keep],
+        translation_m=block.translation_m[keep],
+        camera_index=block.camera_index[keep],
+    )

@@ -9,7 +9,17 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.scene import EdgeStatus, Features, Photo, Reference, ViewGraph
-from jaxba.vision import Pinhole, PosePrior, TwoView, grid_coverage, match_descriptors, prepare_descriptors, verify
+from jaxba.vision import (
+    Descriptors,
+    Pinhole,
+    PosePrior,
+    TwoView,
+    common_ground,
+    grid_coverage,
+    match_descriptors,
+    prepare_descriptors,
+    verify,
+)
 
 _ATTITUDE_STD_RAD = 0.05  # where the reference states none
 
@@ -65,7 +75,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     for partner, overlap in zip(inputs.partners.tolist(), inputs.overlap.tolist(), strict=True):
         second = inputs.photos[partner]
         others = inputs.features[partner]
-        matches, distinctiveness = match_descriptors(prepared, prepare_descriptors(others), params.ratio)
+        matches, distinctiveness = _matches(
+            features, prepared, others, first, second, params.ratio, may_be_apart=not np.isfinite(overlap)
+        )
         two_view = verify(
             features.xy_px[matches[:, 0]],
             others.xy_px[matches[:, 1]],
@@ -83,6 +95,35 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         )
         parts.append(_edge(inputs.image, partner, matches, distinctiveness, coverage, two_view, params))
     return Outputs(view_graph=ViewGraph.concatenate(parts))
+
+
+def _matches(
+    features: Features,
+    prepared: Descriptors,
+    others: Features,
+    first: Photo,
+    second: Photo,
+    ratio: float,
+    *,
+    may_be_apart: bool,
+) -> tuple[Int[np.ndarray, "matches 2"], Float[np.ndarray, " matches"]]:
+    """Return the matches of two photos and how distinct they are; none where the photos show different ground.
+
+    `may_be_apart`: nothing says that they overlap, so that the largest features alone may rule it out.
+    """
+    prepared_others = prepare_descriptors(others)
+    ground = common_ground(
+        prepared,
+        prepared_others,
+        features.xy_px,
+        others.xy_px,
+        (first.width_px, first.height_px),
+        (second.width_px, second.height_px),
+        ratio,
+    )
+    if ground.is_apart and may_be_apart:
+        return np.zeros((0, 2), np.int64), np.zeros(0)
+    return match_descriptors(prepared.take(ground.first), prepared_others.take(ground.second), ratio)
 
 
 def _edge(

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from jaxba.vision._features import detect_features, grid_coverage
     from jaxba.vision._ground import Ground, paint_ground
     from jaxba.vision._nearest import Descriptors, match_descriptors, prepare_descriptors
+    from jaxba.vision._overlap import common_ground
     from jaxba.vision._photo import IMAGE_SUFFIXES, RAW_SUFFIXES, read_photo
     from jaxba.vision._render import expose, ground_points, pixel_rays, render
     from jaxba.vision._two_view import Pinhole, PosePrior, TwoView, verify
@@ -20,9 +21,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "IMAGE_SUFFIXES", "RAW_SUFFIXES", "Descriptors", "Ground", "PhotoTags", "Pinhole", "Pixels", "PosePrior",
-    "TwoView", "attitude_from_nadir_body", "decode", "detect_features", "expose", "grid_coverage", "ground_points",
-    "jpeg_with_tags", "match_descriptors", "paint_ground", "pixel_rays", "prepare_descriptors", "read_photo",
-    "render", "verify",
+    "TwoView", "attitude_from_nadir_body", "common_ground", "decode", "detect_features", "expose", "grid_coverage",
+    "ground_points", "jpeg_with_tags", "match_descriptors", "paint_ground", "pixel_rays", "prepare_descriptors",
+    "read_photo", "render", "verify",
 ]  # fmt: skip
 
 _MODULE_OF = {
@@ -36,6 +37,7 @@ _MODULE_OF = {
     "RAW_SUFFIXES": "jaxba.vision._photo",
     "TwoView": "jaxba.vision._two_view",
     "attitude_from_nadir_body": "jaxba.vision._attitude_tags",
+    "common_ground": "jaxba.vision._overlap",
     "decode": "jaxba.vision._decode",
     "detect_features": "jaxba.vision._features",
     "expose": "jaxba.vision._render",

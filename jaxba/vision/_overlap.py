@@ -27,7 +27,7 @@ class CommonGround:
     """
 
     first: Int[np.ndarray, " rows"]
-    second: Int[np.ndarray, " rows"]
+    second: Int[np.ndarray, " columns"]
     is_apart: bool
 
 

@@ -1,0 +1,66 @@
+"""What may be left out of a search is what the other image does not show."""
+
+import numpy as np
+import pytest
+
+from jaxba.vision import common_ground
+from jaxba.vision._nearest import Descriptors, match_descriptors, unit_descriptors
+
+SIZE = (1600, 1200)
+
+
+def descriptors(values: np.ndarray) -> Descriptors:
+    return Descriptors(values=unit_descriptors(values), is_binary=False, first_index=np.arange(len(values)))
+
+
+def two_images(shift_px: tuple[float, float], turn_rad: float = 0.0, relief_px: float = 0.0, count: int = 6000):
+    """Return two images of one ground, the second moved and turned: pixels and descriptors of each, and true pairs."""
+    rng = np.random.default_rng(3)
+    ground = rng.uniform(-2000, 3600, (2 * count, 2))
+    look = rng.integers(0, 150, (2 * count, 128))
+    cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+    moved = (ground - 800) @ np.array([[cosine, sine], [-sine, cosine]]) + 800 + shift_px
+    moved += relief_px * rng.uniform(-1, 1, (len(ground), 1)) * np.array([1.0, 0.0])
+    images = []
+    for pixels in (ground, moved):
+        rows = rng.permutation(np.flatnonzero(np.all((pixels > 0) & (pixels < SIZE), axis=1)))
+        noisy = np.clip(look[rows] + rng.integers(-10, 11, (len(rows), 128)), 0, 255).astype(np.uint8)
+        images.append((rows, pixels[rows], descriptors(noisy)))
+    return images
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn", "relief", "most"),
+    [((800, 0), 0.0, 0.0, 0.65), ((300, 500), 3.0, 30.0, 0.75), ((-900, 600), 0.5, 30.0, 0.6), ((0, 0), 0.0, 0.0, 1.0)],
+)
+def test_every_true_pair_stays_and_the_rest_goes(shift, turn, relief, most) -> None:
+    (first_rows, first_px, first), (second_rows, second_px, second) = two_images(shift, turn, relief)
+    ground = common_ground(first, second, first_px, second_px, SIZE, SIZE, 0.75)
+    shared = np.intersect1d(first_rows, second_rows)
+    assert not ground.is_apart and len(shared) > 100
+    assert set(shared) <= set(first_rows[ground.first]) and set(shared) <= set(second_rows[ground.second])
+    assert len(ground.first) <= most * len(first_rows)
+
+
+def test_the_search_finds_the_same_matches_without_the_rest() -> None:
+    (_, first_px, first), (_, second_px, second) = two_images((700, 200), 0.1, 20.0)
+    ground = common_ground(first, second, first_px, second_px, SIZE, SIZE, 0.75)
+    whole, _ = match_descriptors(first, second, 0.75)
+    part, _ = match_descriptors(first.take(ground.first), second.take(ground.second), 0.75)
+    whole, part = set(map(tuple, whole.tolist())), set(map(tuple, part.tolist()))
+    assert len(whole) > 300 and len(whole - part) < 0.002 * len(whole)
+
+
+def test_images_of_different_ground_are_apart_and_nothing_is_left_out() -> None:
+    (_, first_px, first), (_, second_px, second) = two_images((5000, 0))
+    ground = common_ground(first, second, first_px, second_px, SIZE, SIZE, 0.75)
+    assert ground.is_apart
+    assert len(ground.first) == len(first_px) and len(ground.second) == len(second_px)
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_few_features_are_all_compared(count: int) -> None:
+    (_, first_px, first), (_, second_px, second) = two_images((100, 0))
+    few = first.take(np.arange(count))
+    ground = common_ground(few, second, first_px[:count], second_px, SIZE, SIZE, 0.75)
+    assert len(ground.first) == count and len(ground.second) == len(second_px)

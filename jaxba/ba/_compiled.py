@@ -5,6 +5,7 @@ are apart. jax's persistent cache, where it is switched on, keeps the result acr
 """
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import jax
 from jax import Array
 from jaxtyping import Float
 
+from jaxba.ba._compiler import compiler_options
 from jaxba.ba._linearise import cost
 from jaxba.ba._rows import Unknowns
 from jaxba.ba._solvers import AbstractSchurSolver, State
@@ -50,8 +52,12 @@ def _compile(solver: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tu
         return cost(system, unknowns)
 
     state = eqx.filter_eval_shape(init, unknowns, system)
-    return Compiled(
-        init=jax.jit(init).lower(unknowns, system).compile(),
-        step=jax.jit(step).lower(unknowns, state, system).compile(),
-        cost=jax.jit(plain_cost).lower(plain, unknowns).compile(),
+    lowered = (
+        jax.jit(step).lower(unknowns, state, system),
+        jax.jit(init).lower(unknowns, system),
+        jax.jit(plain_cost).lower(plain, unknowns),
     )
+    options = compiler_options()
+    with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
+        of_step, of_init, of_cost = pool.map(lambda one: one.compile(compiler_options=options), lowered)
+    return Compiled(init=of_init, step=of_step, cost=of_cost)

@@ -16,7 +16,6 @@ Cost: numpy, and the priors' own derivatives in jitted pieces of `_CHUNK` rows, 
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax import Array
@@ -24,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from jaxba._errors import JaxbaError
+from jaxba.ba._compiler import fast_jit
 from jaxba.ba._parts import Parts, hat, mean_by
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._rows import Rows, Unknowns
@@ -204,7 +204,7 @@ def _derivatives(prior: AbstractPrior, problem: Problem) -> Rows | None:
         return jax.tree.map(lambda *a: np.concatenate(a, axis=-1)[..., : len(index)], *pieces)
 
 
-@eqx.filter_jit
+@fast_jit
 def _of_geometry(prior: AbstractPrior, unknowns: Unknowns) -> Rows:
     rows = prior.rows(unknowns)
     return Rows(residual=rows.residual, pose=rows.pose, lever_arm=rows.lever_arm, point=rows.point)

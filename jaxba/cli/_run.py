@@ -1,14 +1,21 @@
 """`jaxba run`: the pipeline with its progress, then what a surveyor wants to know of the result."""
 
+import re
+import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxba.cli._cache import use_compilation_cache
-from jaxba.cli._text import first_of, many, table, to_json
+from jaxba.cli._main import INTERRUPTED
+from jaxba.cli._text import first_of, many, to_json
 from jaxba.pipeline import Event, Resources, Run, changed, default_settings, run_pipeline, stage_lines, summary
 
 _CLEAR = "\r\x1b[K"
+_LABEL, _MOST_COLUMNS, _LONGEST_NOTE = 10, 120, 900
+_SUMMARY_LABEL = 12
 
 
 def run(
@@ -37,63 +44,103 @@ def run(
             settings = changed(settings, [flag])
     use_compilation_cache()
     show = _Progress(quiet=quiet or as_json)
-    result = run_pipeline(
-        photos,
-        out,
-        settings,
-        until=stage,
-        geotags=geotags,
-        resources=Resources(workers=workers, max_memory=max_memory),
-        tell=show,
-    )
-    facts = summary(result)
+    try:
+        result = run_pipeline(
+            photos,
+            out,
+            settings,
+            until=stage,
+            geotags=geotags,
+            resources=Resources(workers=workers, max_memory=max_memory),
+            tell=show,
+        )
+    except KeyboardInterrupt:
+        print("jaxba: interrupted; what is done is kept, and the same command goes on from there.", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        show.clear()
     if as_json:
-        print(to_json(facts))
-    elif not result.stages_run:
-        print("nothing to do")
+        print(to_json(summary(result)))
     elif not quiet:
         _print_summary(result, out)
     return 0
 
 
 class _Progress:
-    """One line a stage as it ends; while a stage goes over photos, a line that is overwritten on a terminal."""
+    """One line a stage as it ends; on a terminal, a line that is overwritten while a stage runs."""
 
     def __init__(self, *, quiet: bool) -> None:
         self.quiet, self.live = quiet, sys.stderr.isatty()
+        self.said: set[str] = set()
 
     def __call__(self, event: Event) -> None:
         if self.quiet:
             return
         if self.live and event.kind != "end":
             count = f"{event.done} of {many(event.total, 'photo')}" if event.kind == "photo" else "..."
-            print(f"{_CLEAR}{event.stage:<10}{count}", end="", file=sys.stderr, flush=True)
+            print(f"{_CLEAR}{event.stage:<{_LABEL}}{count}", end="", file=sys.stderr, flush=True)
         if event.kind == "end":
-            if self.live:
-                print(_CLEAR, end="", file=sys.stderr, flush=True)
+            self.clear()
             if event.total:
-                first, *more = stage_lines(event)
-                print(f"{event.stage:<10}{first}   {event.seconds:.1f} s", flush=True)
-                for line in more:
-                    print(f"{'':<10}{line}", flush=True)
+                first, *notes = stage_lines(event)
+                print(_wrapped(event.stage, f"{first}   {event.seconds:.1f} s"), flush=True)
+                for note in notes:
+                    if news := self._news(note):
+                        print(_wrapped("", news), flush=True)
+
+    def clear(self) -> None:
+        """Wipe the line that is overwritten."""
+        if self.live and not self.quiet:
+            print(_CLEAR, end="", file=sys.stderr, flush=True)
+
+    def _news(self, note: str) -> str:
+        """Return the sentences of a note that this run has not said yet."""
+        sentences = re.split(r"(?<=\.) (?=[A-Z])", note)
+        news = [sentence for sentence in sentences if sentence not in self.said]
+        self.said.update(sentences)
+        return " ".join(news)
+
+
+def _wrapped(label: str, text: str, indent: int = _LABEL) -> str:
+    """Return a text beside its label, wrapped to the terminal; a very long one is cut."""
+    if len(text) > _LONGEST_NOTE:
+        text = textwrap.shorten(text, _LONGEST_NOTE, placeholder=" ... (the rest is in summary.json)")
+    width = max(min(shutil.get_terminal_size((_MOST_COLUMNS, 24)).columns, _MOST_COLUMNS), indent + 30)
+    lines = textwrap.wrap(
+        text,
+        width,
+        initial_indent=f"{label:<{indent}}",
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return "\n".join(lines)
 
 
 def _print_summary(result: Run, out: Path) -> None:
     facts = summary(result)
-    rows: list[tuple[str, str | Sequence[str]]] = []
+    rows: list[tuple[str, str]] = []
     if "adjust" in facts:
         rows = _result_rows(facts["adjust"])
-    left_out = [f"{entry['name']}: {entry['reason']}" for entry in facts["left_out"]]
-    if left_out:
-        rows.append(("left out", left_out))
+    if facts.get("crs", {}).get("name") and "export" in facts:
+        code = facts["crs"]["epsg"]
+        rows.append(("CRS", facts["crs"]["name"] + (f" (EPSG:{code})" if code else "")))
+    if facts["left_out"]:
+        names = [entry["name"] for entry in facts["left_out"]]
+        rows.append(("left out", f"{many(len(names), 'file')}: {first_of(names)}; why: {out / 'summary.json'}"))
     if "export" in facts:
-        rows.append(("files", [f"{out / 'export'}: {first_of(facts['export']['files'], most=20)}"]))
+        rows.append(
+            ("files", f"{many(len(facts['export']['files']), 'file')} in {out / 'export'}, see README.txt there")
+        )
+    if not result.stages_run:
+        print("nothing to do: the photos and settings are those of the last run")
     print()
-    print(table(rows))
+    for label, text in rows:
+        print(_wrapped(label, text, _SUMMARY_LABEL))
 
 
-def _result_rows(adjust: dict) -> list[tuple[str, str | Sequence[str]]]:
-    rows: list[tuple[str, str | Sequence[str]]] = [
+def _result_rows(adjust: dict[str, Any]) -> list[tuple[str, str]]:
+    rows = [
         ("images", f"{adjust['images']} of {adjust['photos']} adjusted"),
         (
             "points",
@@ -107,6 +154,6 @@ def _result_rows(adjust: dict) -> list[tuple[str, str | Sequence[str]]]:
         rows.append(
             ("GNSS fit", f"RMS {east:.2f}, {north:.2f}, {up:.2f} m east, north, up over {adjust['num_gnss']} positions")
         )
-    if adjust["findings"]:
-        rows.append(("findings", list(adjust["findings"])))
+    for label, finding in zip(["findings"] + [""] * len(adjust["findings"]), adjust["findings"], strict=False):
+        rows.append((label, finding))
     return rows

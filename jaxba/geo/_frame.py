@@ -31,7 +31,9 @@ def local_frame(
     height_datum: str = "unknown",
     declared: str = "by the photos' tags",
 ) -> LocalFrame:
-    """Return the local frame at the middle (median) of a survey on WGS 84, for results in a target CRS.
+    """Return the local frame near the middle (median) of a survey on WGS 84, for results in a target CRS.
+
+    The origin is the middle to a thousandth of a degree (100 m): a photo more or less mostly leaves it where it is.
 
     - `height_m`: NaN where unknown. `height_datum`, `declared`: see `height_step`.
 
@@ -44,8 +46,7 @@ def local_frame(
     """
     lon, lat = middle(longitude_deg, latitude_deg)
     heights = height_m[np.isfinite(height_m)]
-    # rounded, to be readable; the origin is where it is told to be
-    lon, lat, height = round(lon, 7), round(lat, 7), round(float(np.median(heights)), 3) if len(heights) else 0.0
+    lon, lat, height = round(lon, 3), round(lat, 3), round(float(np.median(heights)), 3) if len(heights) else 0.0
     horizontal_operation(crs, lon, lat)
     step = height_step(crs, height_datum, declared, lon, lat, height)
     code = authority_code(crs)

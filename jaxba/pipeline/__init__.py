@@ -7,7 +7,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jaxba.pipeline._runner import Event, Run, run_pipeline
+    from jaxba.pipeline._events import Event, Run
+    from jaxba.pipeline._runner import run_pipeline
     from jaxba.pipeline._settings import changed, default_settings
     from jaxba.pipeline._stages import NAMES, STAGES
     from jaxba.pipeline._summary import stage_lines, summary
@@ -21,9 +22,9 @@ __all__ = [
 _MODULE_OF = {
     "NAMES": "_stages",
     "STAGES": "_stages",
-    "Event": "_runner",
+    "Event": "_events",
     "Resources": "_workers",
-    "Run": "_runner",
+    "Run": "_events",
     "changed": "_settings",
     "default_settings": "_settings",
     "run_pipeline": "_runner",

@@ -11,14 +11,15 @@ project/
 import hashlib
 import json
 import os
+import re
 from pathlib import Path
-from urllib.parse import quote
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._store import cannot_write
 from jaxba.scene import PhotoFile
 
 _GEOTAGS = "geo.txt"
+_LONGEST_NAME = 180  # bytes of a folder's name, which mostly may have 255
 
 
 class Project:
@@ -42,7 +43,7 @@ class Project:
     def stage(self, name: str, photo: str | None = None) -> Path:
         """Return the folder of what a stage made, or made of one photo."""
         folder = self.folder / "stages" / name
-        return folder if photo is None else folder / quote(photo, safe=" ()+,;=@")
+        return folder if photo is None else folder / _folder_name(photo)
 
     def write_json(self, name: str, content: object) -> None:
         """Write a JSON file of the project, whole or not at all."""
@@ -79,7 +80,9 @@ class Project:
                 before = known.get(name)
                 digest = before[2] if isinstance(before, list) and before[:2] == stamp else _sha256(path)
             except OSError as error:
-                raise JaxbaError(f"{path}: cannot be read ({error.strerror}); check its permissions.") from error
+                raise JaxbaError(
+                    f"{path}: cannot be read ({error.strerror}); check its permissions, or delete it."
+                ) from error
             table[name] = [*stamp, digest]
             found.append(PhotoFile(name=name, path=path.absolute(), sha256=digest))
         if table != known:
@@ -90,8 +93,10 @@ class Project:
 def read_geotags(photos: Path, given: Path | None) -> tuple[str, str] | None:
     """Return name and text of the list that replaces the tags: the given one, or `geo.txt` among the photos."""
     path = given or photos / _GEOTAGS
-    if given is None and not path.is_file():
-        return None
+    if not path.is_file():
+        if given is None:
+            return None
+        raise JaxbaError(f"{path}: there is no such file; give a geo.txt or CSV.")
     try:
         return str(path.name), path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -99,19 +104,44 @@ def read_geotags(photos: Path, given: Path | None) -> tuple[str, str] | None:
 
 
 def _files_below(photos: Path, project: Path) -> list[tuple[str, Path]]:
+    """Return name and path of the files below a folder, links followed, by name."""
     if not photos.exists():
         raise JaxbaError(f"{photos}: there is no such folder; give the folder that holds the photos.")
     if not photos.is_dir():
         raise JaxbaError(f"{photos}: is a file; give the folder that holds the photos.")
-    inside = project.resolve()
-    found = []
-    for root, folders, names in os.walk(photos):
-        folders[:] = sorted(f for f in folders if not f.startswith(".") and (Path(root) / f).resolve() != inside)
+    if photos.resolve() == project.resolve():
+        raise JaxbaError(f"{photos}: is the folder of the photos; choose another folder for --out.")
+    been, found = {project.resolve()}, []
+    for root, folders, names in os.walk(photos, onerror=_raise_unreadable, followlinks=True):
+        place = Path(root).resolve()
+        if place in been:  # the project itself, or a link back
+            folders.clear()
+            continue
+        been.add(place)
+        folders[:] = sorted(f for f in folders if not f.startswith("."))
         for name in names:
             path = Path(root) / name
-            if not name.startswith(".") and path.is_file():
-                found.append((path.relative_to(photos).as_posix(), path))
+            if name.startswith(".") or not (path.is_file() or path.is_symlink()):  # a broken link is said later
+                continue
+            found.append((path.relative_to(photos).as_posix(), path))
+    for name, _ in found:
+        if re.search("[\x00-\x1f\x7f\ud800-\udfff]", name):  # the last: bytes that are no UTF-8
+            raise JaxbaError(
+                f"{photos}: the file {name!a} has characters in its name that not every program can write; rename it."
+            )
     return sorted(found)
+
+
+def _raise_unreadable(error: OSError) -> None:
+    raise JaxbaError(f"{error.filename}: cannot be read ({error.strerror}); check its permissions.") from error
+
+
+def _folder_name(photo: str) -> str:
+    """Return a photo's name as that of one folder; a long one is cut, and told apart by a digest."""
+    name = re.sub(r'[%/\\:*?"<>|]', lambda match: f"%{ord(match[0]):02X}", photo)
+    if len(name.encode()) <= _LONGEST_NAME:
+        return name
+    return f"{name.encode()[:_LONGEST_NAME].decode(errors='ignore')}-{hashlib.sha256(photo.encode()).hexdigest()[:16]}"
 
 
 def _sha256(path: Path) -> str:

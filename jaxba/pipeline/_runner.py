@@ -5,47 +5,24 @@ stage whose input was made anew but came out equal is not run again. Stages of p
 that was stopped goes on with the photos that are left, and one that is added costs its own work and that of its pairs.
 """
 
+import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline import _store
+from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._fingerprint import code_version, fingerprint
 from jaxba.pipeline._parameters import Parameters
 from jaxba.pipeline._project import Project, read_geotags
 from jaxba.pipeline._settings import Settings, as_plain
 from jaxba.pipeline._stages import NAMES, STAGES, Done, PhotoItem, Stage, run_photo
+from jaxba.pipeline._summary import left_out, stage_lines, summary
 from jaxba.pipeline._workers import Item, Resources, memory_for, work
 from jaxba.scene import Left
-
-
-@dataclass(frozen=True)
-class Event:
-    """What a run tells while it goes.
-
-    - `kind`: `begin` and `end` of a stage, `photo` after each photo of a stage that goes by photos.
-    - `done`, `total`: photos that were worked on; `total` 0 means that nothing had to be done.
-    - `outputs`: at the end, what the stage made. `left_out`: photos that it could not work on.
-    """
-
-    kind: Literal["begin", "photo", "end"]
-    stage: str
-    done: int = 0
-    total: int = 0
-    seconds: float = 0.0
-    outputs: Any = None
-    left_out: tuple[Left, ...] = ()
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a run made, stage by stage, and which stages had anything to do."""
-
-    done: Done
-    stages_run: tuple[str, ...]
 
 
 def run_pipeline(
@@ -72,24 +49,55 @@ def run_pipeline(
     plain = as_plain(settings)
     if project.read_json("settings.json") != plain:
         project.write_json("settings.json", plain)
-    stages_run = []
+    stages_run: list[str] = []
+    lines: dict[str, list[str]] = {}
     for stage in STAGES:
         begun = time.perf_counter()
         tell(Event("begin", stage.name))
-        params = settings[stage.name]
-        if stage.collect is None:
-            outputs, total, left_out = _run_whole(project, stage, done, params)
-        else:
-            outputs, total, left_out = _run_photos(project, stage, done, params, resources or Resources(), tell)
-            setattr(done, f"{stage.name}_left_out", left_out)
+        try:
+            outputs, total, unused = _run_stage(project, stage, done, settings, resources or Resources(), tell)
+        except (JaxbaError, KeyboardInterrupt) as error:
+            reason = str(error) or "interrupted"
+            with contextlib.suppress(JaxbaError):  # what stopped the run is the news
+                _write_summary(project, Run(done, tuple(stages_run), lines, Left(name=stage.name, reason=reason)))
+            raise
         setattr(done, stage.name, outputs)
+        if stage.collect is not None:
+            setattr(done, f"{stage.name}_left_out", (*unused, *stage.useless(done, outputs)))
         if total:
             stages_run.append(stage.name)
         seconds = time.perf_counter() - begun
-        tell(Event("end", stage.name, total, total, seconds, outputs, left_out))
+        names = tuple(photo.name for photo in done.photos)
+        left_here = left_out(done).get(stage.name, ())
+        event = Event("end", stage.name, total, total, seconds, outputs, left_here, names)
+        lines[stage.name] = stage_lines(event)
+        tell(event)
         if stage.name == until:
             break
-    return Run(done, tuple(stages_run))
+    run = Run(done, tuple(stages_run), lines)
+    _write_summary(project, run)
+    return run
+
+
+def _run_stage(
+    project: Project,
+    stage: Stage,
+    done: Done,
+    settings: Settings,
+    resources: Resources,
+    tell: Callable[[Event], None],
+) -> tuple[Any, int, tuple[Left, ...]]:
+    """Return what a stage made, how much of it had to be done, and the photos that it could not work on."""
+    params = settings[stage.name]
+    if stage.collect is None:
+        return _run_whole(project, stage, done, params)
+    return _run_photos(project, stage, done, params, resources, tell)
+
+
+def _write_summary(project: Project, run: Run) -> None:
+    facts = summary(run)
+    if project.read_json("summary.json") != facts:
+        project.write_json("summary.json", facts)
 
 
 def _run_whole(project: Project, stage: Stage, done: Done, params: Parameters) -> tuple[Any, int, tuple[Left, ...]]:
@@ -142,9 +150,15 @@ def _run_photos(
             reasons[item.name] = record.failed
             if record.failed is None:
                 made[index[item.name]], digests[index[item.name]] = folders[item.name], record.digest
-    left_out = tuple(Left(name=name, reason=reason) for name, reason in sorted(reasons.items()) if reason)
+    unused = tuple(Left(name=n, reason=_without_path(n, why)) for n, why in sorted(reasons.items()) if why)
     if items and not made:
-        first = "; ".join(f"{left.name}: {left.reason}" for left in left_out[:3])
+        first = "; ".join(f"{left.name}: {left.reason}" for left in unused[:3])
         raise JaxbaError(f"stage {stage.name}: none of {len(items)} photos could be used. First: {first}")
     assert stage.collect is not None
-    return stage.collect(done, made, digests), len(waiting), left_out
+    return stage.collect(done, made, digests), len(waiting), unused
+
+
+def _without_path(name: str, reason: str) -> str:
+    """Return a reason without the photo's path before it, which is said beside it, and may have changed since."""
+    before, found, after = reason.partition(name)
+    return after.lstrip(": ") if found and (not before or before.endswith(("/", "\\"))) else reason

@@ -65,11 +65,16 @@ class PhotoItem:
 
 @dataclass(frozen=True)
 class Stage:
-    """- `inputs`: from what is done. `collect`: for a stage that runs once a photo, from its items' folders."""
+    """A stage and how it is fed.
+
+    - `inputs`: from what is done. `collect`: for a stage that runs once a photo, from its items' folders.
+    - `useless`: photos of which such a stage made something that nothing can be done with.
+    """
 
     module: ModuleType
     inputs: Callable[[Done], Any]
     collect: Callable[[Done, dict[int, Any], dict[int, str]], Any] | None = None
+    useless: Callable[[Done, Any], tuple[Left, ...]] = lambda done, outputs: ()
 
     @property
     def name(self) -> str:
@@ -96,36 +101,69 @@ def _features_collected(done: Done, folders: dict[int, Any], digests: dict[int, 
     return Stored(features.Outputs, "features", folders, digests)
 
 
+def _without_keypoints(done: Done, found: Stored) -> tuple[Left, ...]:
+    empty = {index: features for index in sorted(found) if (features := found[index]).num_keypoints == 0}
+    return tuple(Left(name=done.photos[i].name, reason="; ".join(f.notes) + ".") for i, f in empty.items())
+
+
 def _pairs(done: Done) -> pairs.Inputs:
     return pairs.Inputs(photos=done.photos, reference=done.placed)
 
 
+def _partners(done: Done, image: int) -> np.ndarray:
+    """Return the rows of the candidate pairs that a photo is matched in: its partners come after it."""
+    described = np.array(sorted(done.features), dtype=int)
+    first, second = done.pairs.pairs[:, 0], done.pairs.pairs[:, 1]
+    return np.flatnonzero((first == image) & np.isin(second, described) & np.isin(first, described))
+
+
 def _match(done: Done) -> list[PhotoItem]:
-    items, described, reference = [], np.array(sorted(done.features), dtype=int), done.placed
+    """Each photo with its partners alone, counted from 0, placed from the photo: no other photo changes any of it.
+
+    Rounded, since a photo more or less may move the origin of heights: 0.1 mm and a thousandth of the overlap.
+    """
+    items, reference = [], done.placed
     for image, photo in enumerate(done.photos):
-        rows = (done.pairs.pairs[:, 0] == image) & np.isin(done.pairs.pairs[:, 1], described)
-        partners, overlap = np.asarray(done.pairs.pairs[rows, 1]), np.asarray(done.pairs.overlap[rows])
-        images = [image, *partners.tolist()]
-        if image not in done.features or len(partners) == 0:
+        rows = _partners(done, image)
+        if len(rows) == 0:
             continue
+        images = [image, *done.pairs.pairs[rows, 1].tolist()]
+        photos = tuple(done.photos[i] for i in images)
         inputs = match.Inputs(
-            image=image,
-            partners=partners,
-            overlap=overlap,
-            photos=done.photos,
-            reference=reference,
+            image=0,
+            partners=np.arange(1, len(images)),
+            overlap=np.round(done.pairs.overlap[rows], 3),
+            photos=photos,
+            reference=_reference_of(reference, images),
             features=done.features.only(images),
         )
-        shapes = [(done.photos[i].focal_px, done.photos[i].width_px, done.photos[i].height_px) for i in images]
-        columns = ("xyz_m", "std_m", "quaternion", "attitude_std_rad", "is_used")
-        placed = [getattr(reference, column)[images] for column in columns]
-        items.append(PhotoItem(photo.name, inputs, (images, overlap, shapes, placed, inputs.features), 1.0))
+        shapes = [(entry.focal_px, entry.width_px, entry.height_px) for entry in photos]
+        identity = (shapes, inputs.overlap, inputs.reference, inputs.features)
+        items.append(PhotoItem(photo.name, inputs, identity, 1.0))
     return items
+
+
+def _reference_of(reference: Reference, images: list[int]) -> Reference:
+    """Return what is measured of some images, without a frame, positions from the first of them."""
+    xyz_m = reference.xyz_m[images]
+    return Reference(
+        frame=None,
+        xyz_m=np.round(xyz_m - xyz_m[0], 4) + 0.0,  # no -0.0
+        std_m=np.round(reference.std_m[images], 6),
+        quaternion=reference.quaternion[images],
+        attitude_std_rad=reference.attitude_std_rad[images],
+        is_used=reference.is_used[images],
+        height_above_ground_m=np.full(len(images), np.nan),
+    )
 
 
 def _match_collected(done: Done, folders: dict[int, Any], digests: dict[int, str]) -> match.Outputs:
     parts = Stored(match.Outputs, "view_graph", folders, digests)
-    return match.Outputs(view_graph=ViewGraph.concatenate([parts[i] for i in sorted(parts)]))
+    graphs = []
+    for image in sorted(parts):
+        pairs = done.pairs.pairs[_partners(done, image)]
+        graphs.append(dataclasses.replace(parts[image], pairs=np.ascontiguousarray(pairs)))
+    return match.Outputs(view_graph=ViewGraph.concatenate(graphs))
 
 
 def _tracks(done: Done) -> tracks.Inputs:
@@ -148,6 +186,7 @@ def _adjust(done: Done) -> adjust.Inputs:
         view_graph=done.match.view_graph,
         tracks=done.tracks.tracks,
         block=done.start.block,
+        features=done.features,
     )
 
 
@@ -158,7 +197,7 @@ def _export(done: Done) -> export.Inputs:
 STAGES = (
     Stage(metadata, _metadata),
     Stage(crs, _crs),
-    Stage(features, _features, _features_collected),
+    Stage(features, _features, _features_collected, _without_keypoints),
     Stage(pairs, _pairs),
     Stage(match, _match, _match_collected),
     Stage(tracks, _tracks),

@@ -9,7 +9,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -86,10 +86,10 @@ class Stored(Mapping[int, T]):
     def __len__(self) -> int:
         return len(self.folders)
 
-    def only(self, indices: Any) -> "Stored[T]":
-        """Return the same for some of the photos."""
-        chosen = [int(i) for i in indices]
-        return Stored(self.cls, self.field, {i: self.folders[i] for i in chosen}, {i: self.digests[i] for i in chosen})
+    def only(self, indices: Sequence[int]) -> "Stored[T]":
+        """Return some of the photos', counted anew from 0 in the order given."""
+        folders = {row: self.folders[i] for row, i in enumerate(indices)}
+        return Stored(self.cls, self.field, folders, {row: self.digests[i] for row, i in enumerate(indices)})
 
 
 class written_whole:
@@ -130,7 +130,8 @@ def cannot_write(path: Path, error: OSError) -> JaxbaError:
         errno.EPERM: "it may not be written to; choose another --out or change its permissions",
         errno.EROFS: "the file system is read-only; choose another --out",
     }
-    return JaxbaError(f"{path}: {cures.get(error.errno or 0, error.strerror or str(error))}.")
+    other = f"cannot be written ({error.strerror or error}); choose another --out"
+    return JaxbaError(f"{path}: {cures.get(error.errno or 0, other)}.")
 
 
 def _write_record(folder: Path, record: Record, tree: Any) -> None:
@@ -146,7 +147,7 @@ def _content(folder: Path) -> dict[str, Any] | None:
         content = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return content if {"key", "digest", "failed", "value"} <= content.keys() else None
+    return content if isinstance(content, dict) and {"key", "digest", "failed", "value"} <= content.keys() else None
 
 
 def _arrays_to_files(tree: Any, folder: Path, name: str) -> Any:

@@ -1,11 +1,18 @@
 """What a run tells people: a line or two a stage as it ends, and the facts of the whole run for JSON."""
 
+import math
+import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from jaxba.pipeline._runner import Event, Run
+from jaxba.pipeline._events import Event, Run
+from jaxba.pipeline._stages import Done
 from jaxba.scene import EdgeStatus, Left, ViewGraph
+
+_SHOWN, _MOST_LINES = 3, 10
+_NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)")
 
 
 def stage_lines(event: Event) -> list[str]:
@@ -14,39 +21,45 @@ def stage_lines(event: Event) -> list[str]:
     notes: list[str] = []
     if event.stage == "metadata":
         cameras = len({photo.camera for photo in outputs.photos})
-        first = f"{_many(len(outputs.photos), 'photo')}, {_many(cameras, 'camera')}"
-        notes = [*outputs.notes, *_left(outputs.left_out)]
+        left = f", {_many(len(event.left_out), 'file')} left out" if event.left_out else ""
+        first = f"{_many(len(outputs.photos), 'photo')}, {_many(cameras, 'camera')}{left}"
+        notes = [*outputs.notes, *_grouped(event.left_out)]
     elif event.stage == "crs":
         reference = outputs.reference
         where = reference.frame.crs_name if reference.frame is not None else "no place on earth"
         first = f"{where}; {int(reference.is_used.sum())} of {len(reference.is_used)} positions used"
-        notes = [*reference.notes, *_left(reference.review)]
+        notes = [*reference.notes, *_grouped(reference.review)]
     elif event.stage == "features":
-        counts = [outputs[index].num_keypoints for index in sorted(outputs)]
+        found = {index: outputs[index] for index in sorted(outputs)}
+        counts = [features.num_keypoints for features in found.values()]
         first = f"{sum(counts):,} keypoints, median {int(np.median(counts)):,} an image" if counts else "no keypoints"
-        notes = _left(event.left_out)
+        used = [(event.photos[i], features.notes) for i, features in found.items() if features.num_keypoints]
+        odd = [Left(name=name, reason=note) for name, texts in used for note in texts]
+        notes = [*_grouped(event.left_out), *_grouped(_with_ranges(odd))]
     elif event.stage == "pairs":
         share = f" ({len(outputs.pairs) / outputs.num_all:.0%})" if outputs.num_all else ""
         first = f"{len(outputs.pairs):,} of {outputs.num_all:,} pairs{share}, {outputs.method}"
         notes = list(outputs.notes)
+        if notes and notes[0].startswith(f"{len(outputs.pairs):,} of {outputs.num_all:,} pairs"):
+            first = notes.pop(0).removesuffix(".")
     elif event.stage == "match":
         graph: ViewGraph = outputs.view_graph
         good, weak = (int((graph.status == status).sum()) for status in (EdgeStatus.GOOD, EdgeStatus.WEAK))
         rejected = len(graph.pairs) - good - weak
         first = f"{good:,} good pairs, {weak:,} weak, {rejected:,} rejected; {len(graph.matches):,} matches"
-        notes = _left(event.left_out)
+        notes = _grouped(event.left_out)
     elif event.stage == "tracks":
         tracks = outputs.tracks
-        groups = [len(component) for component in tracks.components]
-        first = (
-            f"{tracks.num_tracks:,} tracks, {tracks.num_observations:,} observations; largest group {groups[0]} images"
-        )
+        largest = f"{len(tracks.components[0])} of {_many(len(event.photos), 'photo')} in the largest group"
+        first = f"{tracks.num_tracks:,} tracks, {tracks.num_observations:,} observations; {largest}"
+        notes = list(outputs.notes)
     elif event.stage == "start":
         block = outputs.block
-        first = f"{block.num_images} images, {block.num_points:,} points"
-        notes = [*block.notes, *_left(block.unregistered)]
+        first = f"{_many(block.num_images, 'image')}, {block.num_points:,} points"
+        notes = [*block.notes, *_grouped(event.left_out)]
     elif event.stage == "adjust":
         first = f"median {outputs.median_px:.2f} px, {_many(outputs.rounds, 'round')}"
+        notes = _grouped(event.left_out)
     else:
         first = _many(len(outputs.files), "file")
         notes = list(outputs.notes)
@@ -54,14 +67,17 @@ def stage_lines(event: Event) -> list[str]:
 
 
 def summary(run: Run) -> dict[str, Any]:
-    """Return the facts of a run as plain values: figures of the result, and all that was left out, named."""
+    """Return the facts of a run as plain values: figures of the result, and all that was left out, named.
+
+    `left_out` names each file once, with the first stage that could not use it. `groups` are the photos of each group
+    without common tracks, where there is more than one, the largest first. Numbers that are not finite are None.
+    """
     done = run.done
+    names = () if done.metadata is None else tuple(photo.name for photo in done.photos)
     facts: dict[str, Any] = {"stages_run": list(run.stages_run)}
-    left: list[tuple[str, Left]] = []
-    if done.metadata is not None:
-        left += [("metadata", entry) for entry in done.metadata.left_out]
-    left += [("features", entry) for entry in done.features_left_out]
-    left += [("match", entry) for entry in done.match_left_out]
+    if run.stopped is not None:
+        facts["stopped"] = {"stage": run.stopped.name, "reason": run.stopped.reason}
+    facts["stages"] = {stage: list(lines) for stage, lines in run.lines.items()}
     if done.crs is not None:
         reference = done.crs.reference
         frame = reference.frame
@@ -73,10 +89,11 @@ def summary(run: Run) -> dict[str, Any]:
         }
     if done.pairs is not None:
         facts["pairs"] = {"candidates": len(done.pairs.pairs), "all": done.pairs.num_all, "method": done.pairs.method}
+    if done.tracks is not None and len(done.tracks.tracks.components) > 1:
+        facts["groups"] = [[names[image] for image in group] for group in done.tracks.tracks.components]
     if done.adjust is not None:
         adjusted = done.adjust
         block = adjusted.block
-        left += [("start", entry) for entry in block.unregistered]
         seen = np.bincount(block.observation_point, minlength=block.num_points)
         facts["adjust"] = {
             "photos": len(done.photos),
@@ -99,13 +116,72 @@ def summary(run: Run) -> dict[str, Any]:
         }
     if done.export is not None:
         facts["export"] = {"files": list(done.export.files), "notes": list(done.export.notes)}
-    facts["left_out"] = [{"stage": stage, "name": entry.name, "reason": entry.reason} for stage, entry in left]
-    return facts
+    facts["left_out"] = [
+        {"stage": stage, "name": entry.name, "reason": entry.reason}
+        for stage, entries in left_out(done).items()
+        for entry in entries
+    ]
+    return _finite(facts)
 
 
-def _left(entries: tuple[Left, ...]) -> list[str]:
-    return [f"{entry.name}: {entry.reason}" for entry in entries]
+def left_out(done: Done) -> dict[str, tuple[Left, ...]]:
+    """Return the files that are not in the result, and photos that could not be matched, by stage.
+
+    Each is named once, with the first stage that could not use it.
+    """
+    found: list[tuple[str, tuple[Left, ...]]] = []
+    if done.metadata is not None:
+        found.append(("metadata", done.metadata.left_out))
+    found += [("features", done.features_left_out), ("match", done.match_left_out)]
+    found += [(name, made.block.unregistered) for name in ("start", "adjust") if (made := getattr(done, name))]
+    result: dict[str, tuple[Left, ...]] = {}
+    named: set[str] = set()
+    for stage, entries in found:
+        result[stage] = tuple(entry for entry in entries if entry.name not in named)
+        named.update(entry.name for entry in entries)
+    return result
+
+
+def _grouped(entries: Sequence[Left]) -> list[str]:
+    """Return each reason once, with the photos that it concerns; the first few reasons where there are many."""
+    names: dict[str, list[str]] = {}
+    for entry in entries:
+        names.setdefault(entry.reason, []).append(entry.name)
+    lines = [f"{_some(found)}: {reason}" for reason, found in names.items()]
+    if len(lines) <= _MOST_LINES:
+        return lines
+    rest = sum(len(found) for found in list(names.values())[_MOST_LINES:])
+    return [*lines[:_MOST_LINES], f"and {rest} more such files, each with its reason in summary.json."]
+
+
+def _with_ranges(entries: Sequence[Left]) -> list[Left]:
+    """Return the same, with reasons that differ in their numbers alone made one: `1028 to 1459 keypoints`."""
+    kinds: dict[str, list[Left]] = {}
+    for entry in entries:
+        kinds.setdefault(_NUMBER.sub("#", entry.reason), []).append(entry)
+    result = []
+    for kind, alike in kinds.items():
+        columns = zip(*(_NUMBER.findall(entry.reason) for entry in alike), strict=True)
+        ends = [(min(column, key=float), max(column, key=float)) for column in columns]
+        texts = iter([low if low == high else f"{low} to {high}" for low, high in ends])
+        reason = re.sub("#", lambda _, texts=texts: next(texts), kind)
+        result += [Left(name=entry.name, reason=reason) for entry in alike]
+    return result
+
+
+def _some(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:_SHOWN])
+    return shown if len(names) <= _SHOWN else f"{len(names)} photos ({shown}, ...)"
 
 
 def _many(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def _finite(value: Any) -> Any:
+    """Return plain values in which None stands for numbers that are not finite, which JSON lacks."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,23 +1,28 @@
 """Stage adjust: the bundle adjustment in rounds, with rejection, pruning of edges and triangulation anew."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.scene import Block, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Features, Photo, Reference, Tracks, ViewGraph
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """- `photos`, `reference`, `view_graph`, `tracks`, `block`: of the stages before."""
+    """- `photos`, `reference`, `view_graph`, `tracks`, `block`: of the stages before.
+
+    - `features`: of every photo, by its index, to complete tracks from; opened one after the other.
+    """
 
     photos: tuple[Photo, ...]
     reference: Reference
     view_graph: ViewGraph
     tracks: Tracks
     block: Block
+    features: Mapping[int, Features] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +42,9 @@ class Params(Parameters):
     mad_factor: float = parameter(2.5, low=2, high=5, help="reject over median + factor x MAD")
     min_angle: float = parameter(1.5, low=0.1, high=10, help="least angle between two rays of a point, degrees")
     max_rounds: int = parameter(5, low=1, high=20, help="the most rounds of solving, rejection and triangulation")
+    complete_radius: float = parameter(
+        4.0, low=0, high=50, help="look for features that matching missed so near to a point's pixel, px; 0: do not"
+    )
     edge_median_limit: float = parameter(3.0, low=2, high=6, help="edges of the view graph over it are pruned, px")
 
 
@@ -52,6 +60,7 @@ class Outputs:
     - `gnss_residual_m`: adjusted minus measured position; NaN where none was used.
     - `median_px`, `inlier_rate`, `variance_factor`, `num_rejected`, `rounds`: figures of the adjustment.
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
+    - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
     - `findings`: what a surveyor should know, in sentences: ambiguities, contradictions, bounds reached.
     """
 
@@ -69,6 +78,8 @@ class Outputs:
     variance_factor: float
     num_rejected: int
     rounds: int
+    std_px: float
+    position_scale: Float[np.ndarray, "3"]
     findings: tuple[str, ...] = ()
 
 
@@ -79,10 +90,12 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     """
     from jaxba.sfm import Settings, adjust, findings, gnss_fit, uncertainty  # loads jax, which `--help` must not
 
-    options = {field.name: getattr(params, field.name) for field in fields(params) if field.name != "min_angle"}
+    options = {f.name: getattr(params, f.name) for f in fields(params) if f.name != "min_angle"}
     settings = Settings(min_angle_rad=float(np.deg2rad(params.min_angle)), **options)
     reference, photos = inputs.reference, inputs.photos
-    adjusted = adjust(inputs.block, inputs.tracks, inputs.view_graph, reference, photos, settings)
+    adjusted = adjust(
+        inputs.block, inputs.tracks, inputs.view_graph, reference, photos, settings, inputs.features or None
+    )
     sigmas = uncertainty(adjusted, reference)
     block = adjusted.block
     fit = gnss_fit(block, reference)
@@ -103,5 +116,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         variance_factor=sigmas.variance_factor,
         num_rejected=adjusted.num_rejected,
         rounds=len(adjusted.medians_px),
+        std_px=adjusted.std_px,
+        position_scale=adjusted.position_scale,
         findings=found,
     )

@@ -121,6 +121,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
 def _stop_if_too_few(is_used: np.ndarray, counts: dict[str, int], review: tuple[Left, ...], params: Params) -> None:
     if is_used.sum() >= params.min_positions:
         return
+    if len(is_used) == 1:
+        raise JaxbaError("there is only one photo that can be used; give two or more that overlap.")
     why = "; ".join(f"{kind}: {count}" for kind, count in counts.items()) or "no other photo"
     first = f" (first: {review[0].name} {review[0].reason})" if review else ""
     raise JaxbaError(

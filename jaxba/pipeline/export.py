@@ -16,8 +16,6 @@ from jaxba.pipeline import adjust
 from jaxba.pipeline._parameters import Parameters
 from jaxba.scene import Block, LocalFrame, Photo, Reference
 
-_MEDIAN_OF_LENGTH = np.sqrt(2 * np.log(2))  # of a plane vector with two standard normal components
-
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
@@ -147,15 +145,14 @@ def _write_tile(inputs: Inputs) -> list[str]:
     from jaxba.ba import PRIORS
     from jaxba.io import write_tile
     from jaxba.sfm import to_problem
-    from jaxba.sfm._adjust import position_scale
 
     block = inputs.adjusted.block
     problem = to_problem(
         block,
         inputs.reference,
         inputs.photos,
-        std_px=inputs.adjusted.median_px / _MEDIAN_OF_LENGTH,
-        position_scale=position_scale(block, inputs.reference),
+        std_px=inputs.adjusted.std_px,
+        position_scale=inputs.adjusted.position_scale,
     )
     known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
     left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]

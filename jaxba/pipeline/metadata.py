@@ -16,7 +16,7 @@ from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.scene import Attitude, Left, Photo, PhotoFile
 from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
 
-_SHOWN = 3
+_SHOWN, _SHOWN_CAMERAS = 3, 5
 _MOST_NOTES = 20
 
 
@@ -76,7 +76,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     if not photos:
         reasons = " ".join(f"{left.name}: {left.reason}" for left in left_out[:_SHOWN])
         raise JaxbaError(f"none of the {len(images)} photos can be used. {reasons}")
-    notes = [*_file_notes(files), *_camera_notes(photos, params.focal), *_photo_notes(photos)]
+    notes = [*_file_notes(inputs), *_camera_notes(photos, params.focal), *_photo_notes(photos)]
     if geotags is not None:
         entries, found = match_geotags(geotags, [photo.name for photo in photos], inputs.geotags_name)
         photos = [_tagged(photo, entries.get(photo.name), geotags.is_nadir_zero) for photo in photos]
@@ -99,8 +99,11 @@ def _counted(files: list[PhotoFile]) -> str:
     return f"{len(files)} file{'' if len(files) == 1 else 's'}" + (f": {kinds}" if files else "")
 
 
-def _file_notes(files: list[PhotoFile]) -> list[str]:
-    others = [file for file in files if _suffix(file) not in (*IMAGE_SUFFIXES, *RAW_SUFFIXES)]
+def _file_notes(inputs: Inputs) -> list[str]:
+    known = (*IMAGE_SUFFIXES, *RAW_SUFFIXES)
+    others = [file for file in inputs.files if _suffix(file) not in known]
+    if inputs.geotags is not None:
+        others = [file for file in others if file.name != inputs.geotags_name]
     return [f"Files that are no photos are passed over, {_counted(others)}."] if others else []
 
 
@@ -108,7 +111,10 @@ def _camera_notes(photos: list[Photo], focal_px: float | None) -> list[str]:
     counts = Counter(photo.camera for photo in photos)
     if len(counts) == 1:
         return []
-    cameras = "; ".join(f"{name}: {count}" for name, count in sorted(counts.items()))
+    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    cameras = "; ".join(f"{name}: {count}" for name, count in sorted(ordered[:_SHOWN_CAMERAS]))
+    more = len(counts) - _SHOWN_CAMERAS
+    cameras += f"; and {more} more" if more > 0 else ""
     notes = [f"{len(counts)} cameras, each with its own intrinsics. Photos of each: {cameras}."]
     if focal_px is not None:
         notes.append(f"The given focal length, {focal_px:g} px, is used for all of them.")

@@ -7,9 +7,10 @@
     survey/README.txt
 
 Lines run north and south; the last photos look at the middle of the block from all sides, tilted, which tells the focal
-length apart from the height. Tags hold what a drone knows: a position off by the GNSS's noise, the attitude that the
-gimbal reports, and the focal length of the lens's data sheet. Each step draws from its own random stream, so that one
-option changes nothing but what it names. The same parameters give the same bytes.
+length apart from the height. Tags hold what a drone knows: a position off by the GNSS's noise, the barometer's height
+over the take-off, the attitude that the gimbal reports, and the focal length of the lens's data sheet. Each step draws
+from its own random stream, so that one option changes nothing but what it names. The same parameters give the same
+bytes.
 
 Pixels of marks count from the outer corner of the first pixel, as OpenDroneMap's and jaxba's do: its centre is
 (0.5, 0.5). Heights are above the WGS 84 ellipsoid.
@@ -57,6 +58,7 @@ _RTK_STD_M = 0.1  # receivers that state less have a fixed RTK solution
 _RELIEF, _WAVE = 0.17, 0.5  # of the terrain, shares of the flight height
 _FALLOFF, _NOISE_STD = 0.15, 2.0
 _TRUTH_GRID_M = 0.25
+_BAROMETER_STD_M = 0.2  # of relative altitudes, whatever the GNSS's noise
 _TEXELS_PER_PIXEL = 0.7  # side of a texel over that of a pixel on the ground, straight down
 README, _TITLE = "README.txt", "Simulated survey"
 
@@ -139,8 +141,8 @@ def simulate(params: Params) -> Iterator[tuple[str, bytes]]:
             f"num_oblique={params.num_oblique} leaves fewer than 4 of {params.num_images} photos to look straight "
             "down; choose fewer, or more num_images."
         )
-    streams = np.random.default_rng(params.seed).spawn(7)
-    flight_rng, terrain_rng, paint_rng, gnss_rng, attitude_rng, mark_rng, sensor_rng = streams
+    streams = np.random.default_rng(params.seed).spawn(8)
+    flight_rng, terrain_rng, paint_rng, gnss_rng, attitude_rng, mark_rng, sensor_rng, barometer_rng = streams
     camera, size_px = true_camera(params.width_px), _size_px(params)
     images = tuple(f"SIM_{number:04d}.JPG" for number in range(1, params.num_images + 1))
     terrain = smooth_terrain(terrain_rng, _RELIEF * params.height_m, _WAVE * params.height_m)
@@ -161,6 +163,7 @@ def simulate(params: Params) -> Iterator[tuple[str, bytes]]:
     std_m = np.array([params.gnss_std_h_m, params.gnss_std_h_m, params.gnss_std_v_m])
     measured = flight.center_m + std_m * gnss_rng.normal(size=flight.center_m.shape)
     geodetic = geodetic_from_local(survey_frame(), measured)
+    relative_m = flight.center_m[:, 2] + _BAROMETER_STD_M * barometer_rng.normal(size=params.num_images)
 
     rays = pixel_rays(camera, size_px)
     poses = zip(flight.cam_from_world, flight.center_m, strict=True)
@@ -172,7 +175,7 @@ def simulate(params: Params) -> Iterator[tuple[str, bytes]]:
     yield README, _readme(params)
     for index, (name, plan) in enumerate(zip(images, plans, strict=True)):
         picture = expose(render(ground, plan, size_px), sensor_rng, falloff=_FALLOFF, noise_std=_NOISE_STD)
-        tags = _tags(params, index, geodetic[index], measured[index, 2], flight.tags[index])
+        tags = _tags(params, index, geodetic[index], relative_m[index], flight.tags[index])
         yield f"photos/{name}", jpeg_with_tags(picture, tags)
     yield "gcp_list.txt", _mark_list(marks, images, range(params.num_control))
     yield "check_list.txt", _mark_list(marks, images, range(params.num_control, len(marks.names)))

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.scene import Block, Photo, Reference, Tracks, ViewGraph
 
@@ -37,4 +39,14 @@ class Outputs:
 
 def run(inputs: Inputs, params: Params) -> Outputs:
     """Find start values for the largest component."""
-    raise NotImplementedError
+    from jaxba.sfm import initialise  # loads jax, which the table of stages must not
+
+    block = initialise(
+        inputs.photos,
+        inputs.reference,
+        inputs.view_graph,
+        inputs.tracks,
+        camera_model=params.camera_model,
+        min_angle_rad=float(np.deg2rad(params.min_angle)),
+    )
+    return Outputs(block=block)

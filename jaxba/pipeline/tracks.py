@@ -67,6 +67,8 @@ def _has_keypoints(inputs: Inputs, image: int) -> bool:
 
 def _nothing_joined(inputs: Inputs) -> str:
     graph = inputs.view_graph
+    if len(inputs.photos) == 1:
+        return f"{inputs.photos[0].name} is the only photo that can be used; give two or more that overlap."
     described = sum(_has_keypoints(inputs, image) for image in range(len(inputs.photos)))
     if len(graph.pairs) == 0:
         return (

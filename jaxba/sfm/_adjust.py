@@ -2,13 +2,17 @@
 
 How observations are judged stands in `_judge.py`, how edges are in `_edges.py`.
 
+Tracks are completed before the first round (see `_complete.py`), so that all rounds have one shape: a radius of 2 to
+6 px finds as much at the start values as at adjusted ones (points seen three times or more: +17% and +37% in two
+blocks, 1% more from adjusted poses).
+
 The first round frees the focal length and k1 alone and takes a few steps; all rounds share compiled code. The sigma of
 an observation is estimated from the errors themselves, so that pixels and GNSS are weighed against each other rightly.
 Convergence is judged by the median of the errors: it changes by less than 1%.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,7 +21,8 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import Problem, Solution, make_plan, reprojection_errors, solve
 from jaxba.ba._plan import Shape
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
-from jaxba.scene import Block, Left, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Features, Left, Photo, Reference, Tracks, ViewGraph
+from jaxba.sfm._complete import complete_tracks
 from jaxba.sfm._edges import edge_medians_px, match_rows, without_edges
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
 from jaxba.sfm._points import apply_points, track_rows, triangulate_tracks
@@ -25,6 +30,7 @@ from jaxba.sfm._problem import free_parameters, to_problem, used_positions, with
 from jaxba.sfm._settings import Settings
 
 _SPARE = 0.03  # room for tracks that pruning cuts in two
+_START_ERROR = 0.005  # of the longer side: what start values are good to
 _FIRST_STEPS, _ROUND_STEPS = 12, 40  # before the median has settled
 _CONVERGED = 0.01
 _PLAIN_M, _LEAST_POSITIONS = 1.0, 6
@@ -71,8 +77,11 @@ def adjust(
     reference: Reference,
     photos: Sequence[Photo],
     settings: Settings,
+    features: Mapping[int, Features] | None = None,
 ) -> Adjusted:
     """Return the adjusted block; `block` holds the start values, with points or without.
+
+    `features`: of every image, by index, to complete tracks from; without them tracks stay as they are.
 
     Raises `JaxbaError` where the block has fewer than two images, or no point of it is left.
     """
@@ -81,6 +90,12 @@ def adjust(
     rounds = _Rounds(anchor=block, reference=reference, photos=photos, settings=settings)
     if not block.num_points:
         limit = 4 * settings.track_threshold
+        block = apply_points(block, tracks, triangulate_tracks(block, tracks, settings.min_angle_rad, limit))
+    given, gone = tracks, np.zeros(len(view_graph.pairs), bool)
+    tracks = _completed(given, block, photos, settings, features)
+    if tracks is not given:
+        longer = max(max(photos[i].width_px, photos[i].height_px) for i in block.image_index)
+        limit = max(4 * settings.track_threshold, _START_ERROR * longer)
         block = apply_points(block, tracks, triangulate_tracks(block, tracks, settings.min_angle_rad, limit))
     matches = match_rows(view_graph, tracks)
     pruned, lost, notes, medians = [], [], [], []
@@ -105,10 +120,14 @@ def adjust(
             worst, warnings = _edges_to_prune(view_graph, edge_px, settings.edge_median_limit, photos)
             notes = warnings
             if worst:
-                gone = np.zeros(len(view_graph.pairs), bool)
                 gone[list(worst)] = True
                 pruned += worst.values()
-                tracks, matches = without_edges(tracks, matches, gone)
+                # what completed the tracks is no match, so it would be gone with the edges: they are completed anew
+                tracks, _ = without_edges(given, match_rows(view_graph, given), gone)
+                found = triangulate_tracks(block, tracks, settings.min_angle_rad, limit_px, by_redundancy=True)
+                tracks = _completed(tracks, apply_points(block, tracks, found), photos, settings, features)
+                matches = match_rows(view_graph, tracks)
+                matches = matches.select(~gone[matches.edge])
                 found = triangulate_tracks(block, tracks, settings.min_angle_rad, limit_px, by_redundancy=True)
         block = apply_points(block, tracks, found)
         judged = found.is_point[found.of_track] | (used_in_track(found) < 2)
@@ -140,6 +159,15 @@ def adjust(
         lost=tuple(lost),
         notes=tuple(notes),
     )
+
+
+def _completed(
+    tracks: Tracks, block: Block, photos: Sequence[Photo], settings: Settings, features: Mapping[int, Features] | None
+) -> Tracks:
+    """Return the tracks completed from the block's points, or as they are where that is not wanted."""
+    if features is None or not settings.complete_radius or not block.num_points:
+        return tracks
+    return complete_tracks(block, tracks, features, tuple(photos), radius_px=settings.complete_radius)
 
 
 @dataclasses.dataclass(frozen=True)

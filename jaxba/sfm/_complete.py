@@ -102,10 +102,10 @@ def _links_in(
     owner = np.full(found.num_keypoints, -1)
     owner[tracks.feature_index[in_image]] = tracks.track_index[in_image]
     # a keypoint of several orientations stands there several times: all of them belong to the track of one
-    _, place = np.unique(found.xy_px, axis=0, return_inverse=True)
+    place = np.unique(found.xy_px, axis=0, return_inverse=True)[1].reshape(-1)
     of_place = np.full(place.max(initial=-1) + 1, -1)
-    np.maximum.at(of_place, place.reshape(-1), owner)
-    owner = of_place[place.reshape(-1)]
+    np.maximum.at(of_place, place, owner)
+    owner = of_place[place]
 
     sees = np.zeros(tracks.num_tracks, bool)
     sees[tracks.track_index[in_image]] = True
@@ -117,13 +117,13 @@ def _links_in(
     nothing = np.zeros(0, np.int64)
     if not len(points) or not found.num_keypoints:
         return _Links(nothing, nothing, nothing, nothing, np.zeros(0), np.zeros((0, 2)))
-    near, feature = KDTree(found.xy_px).query(pixel, k=_NEAREST, distance_upper_bound=radius_px)
+    near, feature = map(np.asarray, KDTree(found.xy_px).query(pixel, k=_NEAREST, distance_upper_bound=radius_px))
     which, slot = np.nonzero(np.isfinite(near))
     point, feature = points[which], feature[which, slot]
     given = np.asarray(found.descriptors)[feature]
     distance = np.minimum(*(_distances(known.descriptors[point, side], given, known.is_binary) for side in (0, 1)))
     keep = (distance <= known.limit) & _is_first(point, distance)
-    keep[keep] = _is_first(place.reshape(-1)[feature[keep]], distance[keep])
+    keep[keep] = _is_first(place[feature[keep]], distance[keep])
     point, feature = point[keep], feature[keep]
     return _Links(
         block.track_index[point],

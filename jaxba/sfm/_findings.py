@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import stats
 
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Photo, Reference
@@ -14,6 +15,7 @@ from jaxba.sfm._problem import natural_intrinsics, used_positions
 from jaxba.sfm._uncertainty import Uncertainty
 
 _OUTLIER = 3.0  # sigmas
+_SCATTER, _SIGNIFICANCE = 1.5, 1e-3
 _WEAK_OBSERVATIONS = 20
 _FOCAL_OFF = 0.05  # from the photos' focal length
 _CENTER_OFF = 0.03  # of the width
@@ -149,15 +151,20 @@ def _outliers(block: Block, fit: GnssFit, photos: Sequence[Photo]) -> list[str]:
 
 
 def _scatter(adjusted: Adjusted, reference: Reference, fit: GnssFit) -> list[str]:
-    scale = adjusted.position_scale
-    if scale.max() < 1.5:
+    """Axes in which residuals are over 1.5 times their sigmas, and more than chance makes them (chi-square, 0.1%)."""
+    index = adjusted.block.image_index
+    stated = np.median(reference.std_m[index[used_positions(adjusted.block, reference)]], axis=0)
+    ratio = np.where(fit.is_outlier[:, None], np.nan, fit.residual_m / reference.std_m[index])
+    known = np.count_nonzero(np.isfinite(ratio), axis=0)
+    by_chance = stats.chi2.ppf(1 - _SIGNIFICANCE, np.maximum(known, 1))
+    excess = (adjusted.position_scale >= _SCATTER) & (fit.scale_m >= _SCATTER * stated)
+    excess &= np.nansum(ratio**2, axis=0) > by_chance
+    if not excess.any():
         return []
-    index = adjusted.block.image_index[used_positions(adjusted.block, reference)]
-    stated = np.median(reference.std_m[index], axis=0)
     text = ", ".join(
         f"{axis} {s:.2g} m instead of {t:.2g} m"
-        for axis, s, t, k in zip(("east", "north", "up"), fit.scale_m, stated, scale, strict=True)
-        if k >= 1.5
+        for axis, s, t, k in zip(("east", "north", "up"), fit.scale_m, stated, excess, strict=True)
+        if k
     )
     return [
         f"Measured positions scatter more than their sigmas say ({text}); the sigmas were enlarged to that. Check the "

@@ -32,6 +32,7 @@ from jaxba.sfm._start_cameras import StartCameras, used_cameras
 
 _MAX_EDGE_ERROR = np.deg2rad(6.0)  # the wrong one of a plane's two poses is off by 10 degrees and more
 _RAY_SCALE = 0.01  # radians: an uncalibrated lens's distortion, seen by rays half way out
+_LEAST_SHARE, _USUAL_SHARE = 0.1, 0.5  # of measurements that fit: real blocks have 0.9 and more, chance gives 0.01
 _COARSE, _FINE = 0.02, 0.005  # errors, as shares of the longer side, before and after the first rough adjustment
 
 
@@ -77,6 +78,7 @@ def initialise(
     reasons = dict(start.reasons)
     block = register_more(block, tracks, cameras, component, reasons, min_angle_rad, _FINE * longer)
     block = drop_weak(block, tracks, reference, reasons, min_angle_rad, _FINE * longer, CONTRADICTION)
+    notes += _share_that_fits(block, tracks, component)
     notes += contradictions(block, reference, photos)
     left = unregistered(photos, tracks, block, reasons)
     return dataclasses.replace(used_cameras(block), notes=tuple(notes), unregistered=left)
@@ -192,6 +194,20 @@ def _adjust(block: Block, reference: Reference, focal_std: Float[np.ndarray, " c
     use = reference.is_used[index] & block.is_georeferenced
     xyz = np.where(use[:, None], reference.xyz_m[index], np.nan)
     return adjust_roughly(block, xyz_m=xyz, std_m=reference.std_m[index], focal_std=focal_std)
+
+
+def _share_that_fits(block: Block, tracks: Tracks, component: Int[np.ndarray, " n"]) -> list[str]:
+    """Refuse a block that hardly any measurement fits, and note one that many do not fit."""
+    total = np.count_nonzero(np.isin(tracks.image_index, component))
+    share = block.num_observations / max(total, 1)
+    text = (
+        f"{block.num_observations} of {total} measurements ({share:.0%}) fit the start values of {block.num_images} "
+        f"images. Usual causes are a wrong focal length (camera {block.camera_names[0]}: "
+        f"{block.camera_parameters[0, 0]:.0f} px), mixed cameras and wrong matches"
+    )
+    if share < _LEAST_SHARE:
+        raise JaxbaError(f"start values failed: {text}; check the photos, or set metadata.focal.")
+    return [f"Only {text}."] if share < _USUAL_SHARE else []
 
 
 def _matrices(quaternion: Float[np.ndarray, "images 4"]) -> Float[np.ndarray, "images 3 3"]:

@@ -12,7 +12,6 @@ Cost: 500k observations take 0.35 s (OpenCV's model), after 0.6 s to compile for
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from jax import Array
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxba.ba._compiler import fast_jit
 from jaxba.geometry import CAMERAS, AbstractCamera
 from jaxba.scene import Block
 
@@ -74,7 +74,7 @@ def make_rays(block: Block, image_row: Int[np.ndarray, " rays"], xy_px: Float[np
     )
 
 
-@eqx.filter_jit
+@fast_jit
 def _linearise(
     camera: AbstractCamera, xy_px: Float[Array, "rows 2"]
 ) -> tuple[Float[Array, "rows 3"], Float[Array, "2 3 rows"]]:

@@ -14,6 +14,7 @@ from jaxba.sfm._rigid import rigid_whole
 from jaxba.sfm._start_cameras import StartCameras
 
 CONTRADICTION = 5.0  # sigmas
+_START_STD = 0.005  # of the distance to the points: what an uncalibrated lens makes of start values
 MIN_INLIERS = 12  # with fewer points a wrong pose finds support by chance
 
 
@@ -128,13 +129,25 @@ def unregistered(photos: Sequence[Photo], tracks: Tracks, block: Block, reasons:
 
 
 def sigmas_off(block: Block, reference: Reference) -> Float[np.ndarray, " images"]:
-    """Return by how many sigmas each image is off its trusted position, on the worst axis; infinite without one."""
+    """Return by how many sigmas each image is off its trusted position, on the worst axis; infinite without one.
+
+    The sigma is that of the position and that of the start values together: centimetres cannot be judged yet.
+    """
     index = block.image_index
     known = reference.is_used[index] & block.is_georeferenced
     with np.errstate(invalid="ignore"):
-        off = np.abs(block.centers_m - reference.xyz_m[index]) / reference.std_m[index]
+        std = np.hypot(reference.std_m[index], _START_STD * _distance_m(block))
+        off = np.abs(block.centers_m - reference.xyz_m[index]) / std
     off = np.where(np.isfinite(reference.std_m[index]), off, 0.0)
     return np.where(known, off.max(axis=1), np.inf)
+
+
+def _distance_m(block: Block) -> float:
+    """Return the median distance from a camera to a point that it sees; 0 without points."""
+    if not block.num_observations:
+        return 0.0
+    between = block.points_m[block.observation_point] - block.centers_m[block.observation_image]
+    return float(np.median(np.linalg.norm(between, axis=1)))
 
 
 def _select(block: Block, keep: Bool[np.ndarray, " images"]) -> Block:

@@ -8,7 +8,7 @@ rotation averaging": first the weights of the L1 norm, which outliers hardly mov
 small scale). Where it starts matters more than the loss, so wrong edges are looked for first: around a triangle of
 edges the rotations must close. The start is a maximum spanning tree of edges weighted by matches and closed triangles.
 
-Cost: a sparse factorisation of (images - 1)^2 a step; 500 images and 3000 edges take 0.3 s.
+Cost: a sparse factorisation of (images - 1)^2 a step; 500 images and 6100 edges take 0.3 s.
 """
 
 import numpy as np

@@ -12,7 +12,6 @@ down. Points are eliminated, the reduced system is factored by SuperLU.
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
+from jaxba.ba._compiler import fast_jit
 from jaxba.geometry import CAMERAS, AbstractCamera
 from jaxba.scene import Block
 from jaxba.sfm._sparse import block_diagonal, block_matrix, solve_positive, sum_rows
@@ -292,7 +292,7 @@ def _project(
     return xy, by_cam, by_k1
 
 
-@eqx.filter_jit
+@fast_jit
 def _derivatives(camera: AbstractCamera, in_cam: Float[Array | np.ndarray, "3 n"]) -> Float[Array, "5 2 n"]:
     """Return pixels, and their derivatives by x, y, z and k1."""
 

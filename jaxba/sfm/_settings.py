@@ -17,3 +17,4 @@ class Settings:
     edge_median_limit: float = 3.0
     min_angle_rad: float = 0.026
     max_rounds: int = 5
+    complete_radius: float = 4.0

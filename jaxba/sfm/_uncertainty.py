@@ -1,8 +1,10 @@
 """Sigmas of an adjusted block, from the covariance of its last solve, or why there are none.
 
-The sigma of an observation was estimated from the errors themselves, so the covariance is not scaled by the variance
-factor once more. Positions are known to the mean of all GNSS positions; an offset that these have in common, metres
-for a single receiver, is not in their sigmas, nor here.
+The sigmas of observations are enlarged to how far errors really scatter (see `_spread.py`), so the covariance is not
+scaled by the variance factor once more; a point's own errors count in its sigma.
+
+Positions are known to the mean of all GNSS positions; an offset that these have in common, metres for a single
+receiver, is not in their sigmas, nor here.
 """
 
 import dataclasses
@@ -15,6 +17,7 @@ from jaxba.ba import Covariance, covariance
 from jaxba.scene import Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._problem import used_positions
+from jaxba.sfm._spread import spread, with_own_errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Uncertainty:
     """Sigmas, NaN where they were not computed; `why_not` says why.
 
     - `position_std_m`, `point_std_m`: world. `intrinsics_std`: in the parameters' units, 0 for what is fixed.
-    - `variance_factor`: twice the cost over the redundancy; NaN likewise.
+    - `variance_factor`: twice the cost over the redundancy, by the sigmas that weighed observations; NaN likewise.
     """
 
     position_std_m: Float[np.ndarray, "images 3"]
@@ -37,14 +40,21 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured."""
     block = adjusted.block
     position, point = np.full((block.num_images, 3), np.nan), np.full((block.num_points, 3), np.nan)
+    times = spread(adjusted)
+    observations = adjusted.problem.observations
+    observations = dataclasses.replace(observations, std_px=observations.std_px * times)
+    problem = dataclasses.replace(adjusted.problem, observations=observations)
+    loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
-        found = covariance(adjusted.problem, loss=adjusted.loss)
+        found = covariance(problem, loss=loss)
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")
     why_not = None
     if block.is_georeferenced:
-        position, point = (_std(blocks) for blocks in (found.centers, found.points))
+        position = _std(found.centers)
+        variance = np.maximum(np.einsum("nii->ni", found.points), 0.0)
+        point = np.sqrt(with_own_errors(variance, block, adjusted.error_px, times * adjusted.std_px))
         index = block.image_index[used_positions(block, reference)]
         nowhere = ~np.isfinite(reference.std_m[index]).any(axis=0)
         position[:, nowhere], point[:, nowhere] = np.nan, np.nan
@@ -53,7 +63,8 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
             "Sigmas of positions and points were not computed: without measured positions the block has no place and "
             "no scale to give them in. Add GNSS positions or ground control."
         )
-    return Uncertainty(position, point, _std(found.intrinsics), found.variance_factor, why_not, found)
+    factor = found.variance_factor * times**2  # positions' part of the cost is small
+    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found)
 
 
 def _std(blocks: Float[np.ndarray, "n k k"]) -> Float[np.ndarray, "n k"]:

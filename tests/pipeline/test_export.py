@@ -47,7 +47,7 @@ def adjusted_outputs(flown: Flown, **changes) -> adjust.Outputs:
         position_std_m=np.full((images, 3), 0.02), point_std_m=np.full((points, 3), np.nan),
         intrinsics_std=np.full(block.camera_parameters.shape, np.nan), gnss_residual_m=np.full((images, 3), 0.5),
         gnss_rms_m=(0.5, 0.5, 0.5), num_gnss=images, median_px=float(np.median(flown.error_px)), inlier_rate=1.0,
-        variance_factor=1.0, num_rejected=0, rounds=1,
+        variance_factor=1.0, num_rejected=0, rounds=1, std_px=0.5, position_scale=np.ones(3),
     )  # fmt: skip
 
 

@@ -101,7 +101,7 @@ def test_nothing_joined_stops_with_the_figures_and_the_cure():
         tracks.run(make_inputs({(0, 1): 0, (1, 2): 0}, 4, empty=[3]), tracks.Params())
     with pytest.raises(JaxbaError, match=r"no candidate pair.*pairs\.method=exhaustive"):
         tracks.run(make_inputs({}, 3), tracks.Params())
-    with pytest.raises(JaxbaError, match=r"none of the 1 photos"):
+    with pytest.raises(JaxbaError, match=r"0\.jpg is the only photo that can be used; give two or more"):
         tracks.run(make_inputs({}, 1), tracks.Params())
 
 

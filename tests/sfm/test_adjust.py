@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from completion import features_of, reduced
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from simulated import Simulated, simulate, view_graph_of
@@ -246,6 +247,25 @@ def test_tracks_fall_apart_where_a_pruned_edge_held_them() -> None:
     assert split.rgb.tolist() == [[1, 2, 3], [1, 2, 3]]
     end, _ = without_edges(tracks, match_rows(chain, tracks), np.array([True, False, False]))
     assert end.image_index.tolist() == [1, 2, 3]
+
+
+def test_tracks_are_completed_also_after_an_edge_was_pruned() -> None:
+    whole = simulate(12, seed=4, points_per_image=60.0, mean_track_length=4.0)
+    index = whole.tracks.track_index
+    place = np.arange(len(index)) - np.searchsorted(index, index)
+    cut = with_wrong_edge(replace(whole, tracks=reduced(whole.tracks, place < 2, index)), (0, 2), 20.0)
+    settings = Settings(max_rounds=4)
+    given = cut.block, cut.tracks, cut.view_graph, cut.reference, cut.photos, settings
+    without, completed = adjust(*given), adjust(*given, features_of(whole, 1))
+    assert len(completed.pruned) == len(without.pruned) == 1
+    assert _seen_thrice(without.block) == 0
+    assert _seen_thrice(completed.block) > 0.7 * np.count_nonzero(np.bincount(index) >= 3)
+    off = replace(settings, complete_radius=0.0)
+    assert adjust(*given[:-1], off, features_of(whole, 1)).block.num_observations == without.block.num_observations
+
+
+def _seen_thrice(block: Block) -> int:
+    return int(np.count_nonzero(np.bincount(block.observation_point) >= 3))
 
 
 def test_a_single_image_is_refused(clean: Simulated) -> None:

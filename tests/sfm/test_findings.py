@@ -82,8 +82,16 @@ def test_wrong_positions_are_named_and_left_out_of_the_rms(adjusted: Adjusted, s
 
 
 def test_positions_that_scatter_more_than_they_claim_are_reported(adjusted: Adjusted, survey: Simulated) -> None:
-    text = _findings(replace(adjusted, position_scale=np.array([1.0, 1.0, 4.0])), survey)
+    xyz = survey.reference.xyz_m.copy()
+    xyz[:, 2] += 0.24 * np.random.default_rng(1).normal(size=12)
+    wide = replace(survey.reference, xyz_m=xyz)
+    text = _findings(replace(adjusted, position_scale=np.array([1.0, 1.0, 4.0])), survey, wide)
     assert "scatter more than their sigmas say (up " in text and "instead of 0.06 m" in text
+
+
+def test_scatter_within_chance_is_no_finding(adjusted: Adjusted, survey: Simulated) -> None:
+    text = _findings(replace(adjusted, position_scale=np.array([1.6, 1.1, 1.6])), survey)
+    assert "scatter more" not in text
 
 
 def test_heights_that_drift_are_reported(adjusted: Adjusted, survey: Simulated) -> None:

@@ -181,7 +181,7 @@ def test_no_relative_pose_at_all_is_an_error_that_names_the_cure() -> None:
 def test_features_that_show_nothing_in_common_are_an_error_that_names_the_focal_length() -> None:
     case = make_case(8)
     scattered = np.random.default_rng(0).uniform(0, [5472, 3648], case.tracks.xy_px.shape)
-    with pytest.raises(JaxbaError, match=r"start values failed: \d+ points of \d images.*camera c: .* px"):
+    with pytest.raises(JaxbaError, match=r"start values failed: .*focal length.*camera c: .* px"):
         start(case, tracks=dataclasses.replace(case.tracks, xy_px=scattered))
 
 

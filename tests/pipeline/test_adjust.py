@@ -1,0 +1,58 @@
+"""The adjust stage: its outputs fit together, and its parameters reach the rounds."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxba.pipeline import adjust
+from jaxba.pipeline.adjust import Inputs, Outputs, Params
+
+sys.path.append(str(Path(__file__).parents[1] / "sfm"))
+from simulated import Simulated, simulate
+
+
+@pytest.fixture(scope="module")
+def simulated() -> Simulated:
+    return simulate(10, seed=8, points_per_image=60.0, outlier_fraction=0.05)
+
+
+@pytest.fixture(scope="module")
+def outputs(simulated: Simulated) -> Outputs:
+    inputs = Inputs(
+        photos=simulated.photos,
+        reference=simulated.reference,
+        view_graph=simulated.view_graph,
+        tracks=simulated.tracks,
+        block=simulated.block,
+    )
+    return adjust.run(inputs, Params(max_rounds=3))
+
+
+def test_outputs_are_of_one_block(outputs: Outputs, simulated: Simulated) -> None:
+    block = outputs.block
+    assert outputs.error_px.shape == (block.num_observations,) and np.isfinite(outputs.error_px).all()
+    assert outputs.median_px == pytest.approx(float(np.median(outputs.error_px)))
+    by_point = [outputs.error_px[block.observation_point == p].mean() for p in range(5)]
+    np.testing.assert_allclose(outputs.point_error_px[:5], by_point)
+    judged = block.num_observations + outputs.num_rejected
+    assert outputs.inlier_rate == pytest.approx(block.num_observations / judged)
+    assert judged <= simulated.tracks.num_observations
+    assert outputs.rounds <= 3 and 0.5 < outputs.variance_factor < 1.5
+
+
+def test_the_block_is_where_it_was_flown(outputs: Outputs, simulated: Simulated) -> None:
+    error = outputs.block.centers_m - np.asarray(simulated.survey.truth.poses.center)
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    assert outputs.num_gnss == 10 and outputs.gnss_rms_m is not None and max(outputs.gnss_rms_m) < 0.12
+    np.testing.assert_allclose(outputs.gnss_residual_m, outputs.block.centers_m - simulated.reference.xyz_m, atol=1e-12)
+    assert np.isfinite(outputs.position_std_m).all() and np.isfinite(outputs.point_std_m).all()
+    assert 0.005 < np.median(outputs.position_std_m) < 0.06  # GNSS of 3 to 6 cm
+
+
+def test_parameters_out_of_range_are_refused() -> None:
+    from jaxba import JaxbaError
+
+    with pytest.raises(JaxbaError, match="mad_factor=9"):
+        Params(mad_factor=9.0)

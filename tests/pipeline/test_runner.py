@@ -1,0 +1,229 @@
+"""What a run does again and what it does not: a changed thing reruns what depends on it, and nothing else."""
+
+import dataclasses
+import io
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_survey import NUM_PHOTOS, Survey
+
+from jaxba import JaxbaError
+from jaxba.pipeline import NAMES, Event, adjust, default_settings, run_pipeline, start, summary
+from jaxba.pipeline._fingerprint import fingerprint
+
+FIRST, LAST = "SIM_0001.JPG", f"SIM_{NUM_PHOTOS:04d}.JPG"
+
+
+@pytest.fixture
+def quick(made: Survey, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put the outputs of the whole run in place of the two stages that compile, with a mark of what went in."""
+    done = made.run().done
+    block = done.start.block
+
+    def start_run(inputs: start.Inputs, params: start.Params) -> start.Outputs:
+        return start.Outputs(block=dataclasses.replace(block, notes=(fingerprint(inputs, params),)))
+
+    def adjust_run(inputs: adjust.Inputs, params: adjust.Params) -> adjust.Outputs:
+        return dataclasses.replace(done.adjust, findings=(fingerprint(inputs, params),))
+
+    monkeypatch.setattr(start, "run", start_run)
+    monkeypatch.setattr(adjust, "run", adjust_run)
+
+
+def inodes(folder: Path) -> dict[str, int]:
+    """Return each record below a folder with its inode: a folder that was made anew has another."""
+    return {p.parent.relative_to(folder).as_posix(): p.stat().st_ino for p in folder.rglob("record.json")}
+
+
+def made_anew(before: dict[str, int], after: dict[str, int]) -> set[str]:
+    return {name for name in after if after[name] != before.get(name)}
+
+
+def exported(project: Path) -> dict[str, bytes]:
+    files = sorted(path for path in (project / "export").rglob("*") if path.is_file())
+    return {path.relative_to(project / "export").as_posix(): path.read_bytes() for path in files}
+
+
+def change_pixels(path: Path) -> None:
+    """Blacken a corner of a JPEG, keeping the segments of its tags as they are."""
+    content = path.read_bytes()
+    with Image.open(io.BytesIO(content)) as image:
+        pixels = np.array(image)
+    pixels[:120, :160] = 0
+    changed = io.BytesIO()
+    Image.fromarray(pixels).save(changed, "JPEG", quality=95)
+    tables = b"\xff\xdb"
+    path.write_bytes(content[: content.index(tables)] + changed.getvalue()[changed.getvalue().index(tables) :])
+
+
+def test_a_run_adjusts_every_photo_and_says_so(made: Survey):
+    facts = json.loads((made.project / "summary.json").read_text())
+    assert list(facts["stages"]) == list(NAMES)
+    assert facts["adjust"]["images"] == NUM_PHOTOS and facts["left_out"] == [] and "groups" not in facts
+    assert facts["adjust"]["median_px"] < 0.3
+    assert {"README.txt", "cloud.laz", "cameras.gpkg"} <= set(facts["export"]["files"]) == set(exported(made.project))
+
+
+def test_a_second_run_does_nothing_and_is_quick(made: Survey):
+    before, seconds = inodes(made.project), []
+    for _ in range(3):  # other programs may take the cores for a while
+        begun = time.perf_counter()
+        run = made.run()
+        seconds.append(time.perf_counter() - begun)
+        assert run.stages_run == () and inodes(made.project) == before
+    assert min(seconds) < 1.0
+
+
+def test_touched_photos_rerun_nothing(made: Survey, tmp_path: Path):
+    survey = made.copy(tmp_path, photos=True)
+    survey.run(until="metadata")  # they have moved
+    for path in survey.photos.iterdir():
+        os.utime(path, (1e9, 1e9))
+    assert survey.run().stages_run == ()
+
+
+def test_a_moved_photo_folder_reruns_metadata_alone(made: Survey, tmp_path: Path):
+    survey = made.copy(tmp_path, photos=True)
+    run = survey.run()
+    assert run.stages_run == ("metadata",)
+    assert all(photo.path.parent == survey.photos for photo in run.done.photos)
+
+
+def test_a_changed_parameter_reruns_its_stage_and_what_follows(made: Survey, tmp_path: Path, quick):
+    survey = made.copy(tmp_path)
+    assert survey.run("match.ratio=0.7").stages_run == ("match", "tracks", "start", "adjust", "export")
+    assert survey.run("match.ratio=0.7").stages_run == ()
+    assert survey.run("match.ratio=0.7", "adjust.f_scale=2").stages_run == ("adjust", "export")
+    # another parameter that changes no output stops there
+    assert survey.run("match.ratio=0.7", "adjust.f_scale=2", "tracks.require_connected=true").stages_run == ("tracks",)
+
+
+def test_another_target_crs_reruns_crs_and_export_alone(made: Survey, tmp_path: Path):
+    survey = made.copy(tmp_path)
+    before = exported(survey.project)
+    run = survey.run("crs.target_crs=EPSG:6344")  # NAD83(2011) / UTM zone 15N
+    assert run.stages_run == ("crs", "export")
+    assert summary(run)["crs"]["epsg"] == 6344
+    assert exported(survey.project)["cloud.laz"] != before["cloud.laz"]
+
+
+def test_a_changed_photo_redoes_its_features_and_its_pairs_alone(made: Survey, tmp_path: Path, quick):
+    survey = made.copy(tmp_path, photos=True)
+    change_pixels(survey.photos / FIRST)
+    before = inodes(survey.project / "stages")
+    run = survey.run()
+    anew = made_anew(before, inodes(survey.project / "stages"))
+    assert {name for name in anew if "/" in name} == {f"features/{FIRST}", f"match/{FIRST}"}
+    assert set(run.stages_run) >= {"metadata", "features", "match", "tracks", "start", "adjust", "export"}
+
+
+def test_a_removed_photo_costs_the_pairs_of_others_only_where_it_was_one_of_them(made: Survey, tmp_path: Path, quick):
+    survey = made.copy(tmp_path, photos=True)
+    (survey.photos / FIRST).unlink()
+    before = inodes(survey.project / "stages")
+    run = survey.run(until="tracks")
+    assert {name for name in made_anew(before, inodes(survey.project / "stages")) if "/" in name} == set()
+    assert run.done.photos[0].name == "SIM_0002.JPG" and len(run.done.photos) == NUM_PHOTOS - 1
+    fresh = Survey(survey.photos, tmp_path / "fresh").run(until="tracks")
+    assert fingerprint(run.done.tracks) == fingerprint(fresh.done.tracks)
+    assert fingerprint(run.done.match) == fingerprint(fresh.done.match)
+
+
+def test_a_missing_export_is_written_again(made: Survey, tmp_path: Path):
+    survey = made.copy(tmp_path)
+    before = exported(survey.project)
+    (survey.project / "export" / "cloud.csv").unlink()
+    assert survey.run().stages_run == ("export",)
+    assert exported(survey.project) == before
+
+
+def test_damaged_records_are_made_anew(made: Survey, tmp_path: Path):
+    survey = made.copy(tmp_path)
+    before = inodes(survey.project / "stages")
+    damaged = {"pairs": "", f"features/{FIRST}": "{", f"match/{FIRST}": '{"key": "one"}', "metadata": "[]"}
+    for name, content in damaged.items():
+        (survey.project / "stages" / name / "record.json").write_text(content)
+    run = survey.run()
+    assert run.stages_run == ("metadata", "features", "pairs", "match")
+    assert made_anew(before, inodes(survey.project / "stages")) == set(damaged)
+
+
+def test_a_stopped_run_goes_on_with_the_photos_that_are_left(photos: Path, tmp_path: Path):
+    survey, totals = Survey(photos, tmp_path / "project"), []
+
+    def stop(event: Event) -> None:
+        if event.stage == "features" and event.kind == "photo" and event.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        survey.run(until="features", workers=1, tell=stop)
+    facts = json.loads((survey.project / "summary.json").read_text())
+    assert facts["stopped"] == {"stage": "features", "reason": "interrupted"}
+    before = inodes(survey.project / "stages")
+    assert 2 <= sum(name.startswith("features/") for name in before) < NUM_PHOTOS
+    run = survey.run(until="features", workers=1, tell=lambda event: totals.append((event.stage, event.total)))
+    after = inodes(survey.project / "stages")
+    assert run.stages_run == ("features",)
+    assert max(total for stage, total in totals if stage == "features") == len(after) - len(before)
+    assert made_anew(before, after) == set(after) - set(before) and len(run.done.features) == NUM_PHOTOS
+    assert "stopped" not in json.loads((survey.project / "summary.json").read_text())
+
+
+def test_a_run_stops_after_the_stage_that_it_is_told_and_the_project_keeps_the_rest(made: Survey, tmp_path: Path):
+    survey = made.copy(tmp_path)
+    run = survey.run(until="pairs")
+    assert run.stages_run == () and run.done.pairs is not None and run.done.match is None
+    assert survey.run().stages_run == ()
+    with pytest.raises(JaxbaError, match="stage 'paris': choose one of metadata, crs, features, pairs"):
+        survey.run(until="paris")
+
+
+def test_geotags_replace_the_tags_and_another_list_reruns_what_depends_on_it(made: Survey, tmp_path: Path):
+    survey = made.copy(tmp_path)
+    photos = survey.run(until="crs").done.photos
+
+    def listed(name: str, step_m: float) -> Path:
+        rows = [
+            f"{photo.name} {photo.position.x:.8f} {photo.position.y:.8f} {photo.position.z_m + step_m:.3f}"
+            for photo in photos
+            if photo.position is not None
+        ]
+        (tmp_path / name).write_text("\n".join(["EPSG:4326", *rows, ""]))
+        return tmp_path / name
+
+    one, two = listed("geo.txt", 0.0), listed("other.txt", 50.0)
+    found = [survey.run(until="crs", geotags=path) for path in (one, two, two)]
+    assert [run.stages_run for run in found] == [("metadata", "crs"), ("metadata", "crs"), ()]
+    heights = [np.median([photo.position.z_m for photo in run.done.photos]) for run in found]
+    assert heights[1] - heights[0] == pytest.approx(50, abs=0.01)
+    with pytest.raises(JaxbaError, match=r"none\.txt: there is no such file"):
+        survey.run(until="crs", geotags=tmp_path / "none.txt")
+
+
+@pytest.mark.slow
+def test_results_are_the_same_bytes_whatever_the_number_of_workers(made: Survey, tmp_path: Path):
+    other = Survey(made.photos, tmp_path / "project")
+    other.run(workers=1)
+    one, two = exported(made.project), exported(other.project)
+    assert list(one) == list(two) and [name for name in one if one[name] != two[name]] == []
+
+
+def test_an_export_folder_that_was_removed_is_written_again(made: Survey, tmp_path: Path):
+    survey = made.copy(tmp_path)
+    shutil.rmtree(survey.project / "export")
+    assert survey.run().stages_run == ("export",)
+
+
+def test_parameters_of_the_last_run_lie_in_the_project(made: Survey):
+    assert json.loads((made.project / "settings.json").read_text())["features"]["nfeatures"] == 2000
+
+
+def test_a_project_folder_is_not_the_photo_folder(photos: Path):
+    with pytest.raises(JaxbaError, match="is the folder of the photos; choose another folder for --out"):
+        run_pipeline(photos, photos, default_settings())

@@ -55,7 +55,7 @@ def test_a_second_run_says_that_there_is_nothing_to_do(cli: Cli, made: Survey, t
     assert first == "nothing to do: the photos and settings are those of the last run"
     assert f"images      {NUM_PHOTOS} of {NUM_PHOTOS} adjusted" in lines
     assert "CRS         WGS 84 / UTM zone 15N (EPSG:32615)" in lines
-    assert any(line.startswith("files       17 files in ") for line in lines)
+    assert any(line.startswith("files       17 files in") for line in lines)
     assert cli("run", survey.photos, "--out", survey.project, *FLAGS, "--quiet") == (0, "", "")
 
 

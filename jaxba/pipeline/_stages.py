@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from jaxba.pipeline import adjust, crs, export, features, match, metadata, pairs, start, tracks
-from jaxba.pipeline._store import Stored
+from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
+from jaxba.pipeline._store import Stored, load
 from jaxba.scene import Left, PhotoFile, Reference, ViewGraph
 
 
@@ -121,8 +122,10 @@ def _match(done: Done) -> list[PhotoItem]:
     """Each photo with its partners alone, counted from 0, placed from the photo: no other photo changes any of it.
 
     Rounded, since a photo more or less may move the origin of heights: 0.1 mm and a thousandth of the overlap.
+    Heights above ground, the files and their size count where ORB may fall back to SIFT, and nowhere else.
     """
     items, reference = [], done.placed
+    is_orb = any(done.features[index].detector == "orb" for index in list(done.features)[:1])  # all are of one kind
     for image, photo in enumerate(done.photos):
         rows = _partners(done, image)
         if len(rows) == 0:
@@ -134,17 +137,22 @@ def _match(done: Done) -> list[PhotoItem]:
             partners=np.arange(1, len(images)),
             overlap=np.round(done.pairs.overlap[rows], 3),
             photos=photos,
-            reference=_reference_of(reference, images),
+            reference=_reference_of(reference, images, with_heights=is_orb),
             features=done.features.only(images),
         )
         shapes = [(entry.focal_px, entry.width_px, entry.height_px) for entry in photos]
         identity = (shapes, inputs.overlap, inputs.reference, inputs.features)
-        items.append(PhotoItem(photo.name, inputs, identity, 1.0))
+        megapixels = 1.0
+        if np.isfinite(inputs.reference.height_above_ground_m[0]):
+            identity = (*identity, [entry.sha256 for entry in photos])
+            megapixels = max(entry.megapixels for entry in photos)
+        items.append(PhotoItem(photo.name, inputs, identity, megapixels))
     return items
 
 
-def _reference_of(reference: Reference, images: list[int]) -> Reference:
+def _reference_of(reference: Reference, images: list[int], *, with_heights: bool) -> Reference:
     """Return what is measured of some images, without a frame, positions from the first of them."""
+    heights_m = np.round(reference.height_above_ground_m[images], 2)
     xyz_m = reference.xyz_m[images]
     return Reference(
         frame=None,
@@ -153,21 +161,28 @@ def _reference_of(reference: Reference, images: list[int]) -> Reference:
         quaternion=reference.quaternion[images],
         attitude_std_rad=reference.attitude_std_rad[images],
         is_used=reference.is_used[images],
-        height_above_ground_m=np.full(len(images), np.nan),
+        height_above_ground_m=heights_m if with_heights else np.full(len(images), np.nan),
     )
 
 
 def _match_collected(done: Done, folders: dict[int, Any], digests: dict[int, str]) -> match.Outputs:
-    parts = Stored(match.Outputs, "view_graph", folders, digests)
-    graphs = []
-    for image in sorted(parts):
+    graphs, num_fallback = [], 0
+    fallback: dict[int, FallbackKeypoints] = {}
+    for image in sorted(folders):
+        part = load(folders[image], match.Outputs)
         pairs = done.pairs.pairs[_partners(done, image)]
-        graphs.append(dataclasses.replace(parts[image], pairs=np.ascontiguousarray(pairs)))
-    return match.Outputs(view_graph=ViewGraph.concatenate(graphs))
+        graphs.append(dataclasses.replace(part.view_graph, pairs=np.ascontiguousarray(pairs)))
+        images = [image, *pairs[:, 1].tolist()]
+        for entry in part.fallback:  # the same of an image, whichever photo it was matched with
+            fallback.setdefault(images[entry.image], dataclasses.replace(entry, image=images[entry.image]))
+        num_fallback += part.num_fallback
+    found = tuple(fallback[image] for image in sorted(fallback))
+    return match.Outputs(view_graph=ViewGraph.concatenate(graphs), fallback=found, num_fallback=num_fallback)
 
 
 def _tracks(done: Done) -> tracks.Inputs:
-    return tracks.Inputs(photos=done.photos, features=done.features, view_graph=done.match.view_graph)
+    found = WithFallback(done.features, done.match.fallback) if done.match.fallback else done.features
+    return tracks.Inputs(photos=done.photos, features=found, view_graph=done.match.view_graph)
 
 
 def _start(done: Done) -> start.Inputs:

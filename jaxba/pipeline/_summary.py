@@ -47,7 +47,9 @@ def stage_lines(event: Event) -> list[str]:
         good, weak = (int((graph.status == status).sum()) for status in (EdgeStatus.GOOD, EdgeStatus.WEAK))
         rejected = len(graph.pairs) - good - weak
         first = f"{good:,} good pairs, {weak:,} weak, {rejected:,} rejected; {len(graph.matches):,} matches"
-        notes = _grouped(event.left_out)
+        again = outputs.num_fallback
+        notes = [f"{_many(again, 'pair')} failed with ORB and {'was' if again == 1 else 'were'} matched with SIFT."]
+        notes = [*(notes if again else ()), *_grouped(event.left_out)]
     elif event.stage == "tracks":
         tracks = outputs.tracks
         largest = f"{len(tracks.components[0])} of {_many(len(event.photos), 'photo')} in the largest group"
@@ -132,7 +134,9 @@ def left_out(done: Done) -> dict[str, tuple[Left, ...]]:
     found: list[tuple[str, tuple[Left, ...]]] = []
     if done.metadata is not None:
         found.append(("metadata", done.metadata.left_out))
-    found += [("features", done.features_left_out), ("match", done.match_left_out)]
+    matched = {done.photos[entry.image].name for entry in done.match.fallback} if done.match is not None else set()
+    without = tuple(entry for entry in done.features_left_out if entry.name not in matched)  # SIFT found some after all
+    found += [("features", without), ("match", done.match_left_out)]
     found += [(name, made.block.unregistered) for name in ("start", "adjust") if (made := getattr(done, name))]
     result: dict[str, tuple[Left, ...]] = {}
     named: set[str] = set()

@@ -1,5 +1,6 @@
 """Stage match: verified matches of one photo with its candidate partners; called once a photo, in workers."""
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxba.pipeline._fallback import FallbackKeypoints, detect_fallback
 from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.scene import EdgeStatus, Features, Photo, Reference, ViewGraph
 from jaxba.vision import (
@@ -29,7 +31,7 @@ class Inputs:
     """One photo and those of its candidate partners whose index is larger.
 
     - `image`: its index. `partners`: theirs, rising. `overlap`: of each pair, NaN where unknown.
-    - `photos`: all photos. `reference`: for the planar two-fold ambiguity.
+    - `photos`: all photos. `reference`: for the planar two-fold ambiguity; its heights, for the fallback of ORB.
     - `features`: by image index, opened on access; a partner whose features failed is not among `partners`.
     """
 
@@ -53,48 +55,97 @@ class Params(Parameters):
     min_inliers: int = parameter(12, low=8, high=30, help="fewer verified matches make no edge")
     min_good: int = parameter(30, low=8, high=100, help="verified matches of a good pair")
     min_inlier_ratio: float = parameter(0.35, low=0.2, high=0.8, help="verified over putative matches of a good pair")
+    fallback_gsd: float = parameter(
+        0.03, low=0.005, high=0.5, help="m/px; a pair that fails with ORB is matched with SIFT over this ground sample"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """- `view_graph`: the photo's pairs."""
+    """- `view_graph`: the photo's pairs.
+    - `fallback`: SIFT keypoints of photos with a pair that failed with ORB and was matched with SIFT. Its matches count
+      them on from the photo's ORB features. `num_fallback`: how many such pairs there are.
+    """
 
     view_graph: ViewGraph
+    fallback: tuple[FallbackKeypoints, ...] = ()
+    num_fallback: int = 0
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
     """Match one photo with its partners and verify the matches.
 
     Keypoints at one position, of several orientations, all take part; matches speak of the first of them. A pair that
-    fails is an edge of status `REJECTED`, without matches, its figures kept.
+    fails is an edge of status `REJECTED`, without matches, its figures kept. Where the features are ORB and the pair's
+    ground sample distance is known to be coarse, it is matched with SIFT before it is given up.
+
+    Raises `JaxbaError` where that needs a photo which cannot be decoded any more.
     """
-    first = inputs.photos[inputs.image]
     features = inputs.features[inputs.image]
     prepared = prepare_descriptors(features)
-    parts = []
+    own: tuple[Features, Descriptors] | None = None  # SIFT, once a pair asks for it
+    parts, fallback = [], {}
+    num_fallback = 0
     for partner, overlap in zip(inputs.partners.tolist(), inputs.overlap.tolist(), strict=True):
-        second = inputs.photos[partner]
         others = inputs.features[partner]
-        matches, distinctiveness = _matches(
-            features, prepared, others, first, second, params.ratio, may_be_apart=not np.isfinite(overlap)
-        )
-        two_view = verify(
-            features.xy_px[matches[:, 0]],
-            others.xy_px[matches[:, 1]],
-            _pinhole(first),
-            _pinhole(second),
-            threshold_px=float(params.ransac_threshold or _threshold_px(first, second, overlap)),
-            confidence=float(params.confidence),
-            min_inliers=params.min_inliers,
-            prior=_prior(inputs.reference, inputs.image, partner),
-        )
-        inliers = matches[two_view.is_inlier]
-        coverage = min(
-            grid_coverage(features.xy_px[inliers[:, 0]], first.width_px, first.height_px),
-            grid_coverage(others.xy_px[inliers[:, 1]], second.width_px, second.height_px),
-        )
-        parts.append(_edge(inputs.image, partner, matches, distinctiveness, coverage, two_view, params))
-    return Outputs(view_graph=ViewGraph.concatenate(parts))
+        edge = _matched(inputs, partner, overlap, features, prepared, others, params)
+        if not edge.is_edge[0] and _may_fall_back(inputs, partner, features, others, params):
+            if own is None:
+                found = detect_fallback(inputs.photos[inputs.image])
+                own = found, prepare_descriptors(found)
+            sift = detect_fallback(inputs.photos[partner])
+            again = _matched(inputs, partner, overlap, *own, sift, params)
+            if again.is_edge[0]:
+                behind = np.array([features.num_keypoints, others.num_keypoints], np.int32)
+                edge = dataclasses.replace(again, matches=again.matches + behind)
+                for image, kind in ((inputs.image, own[0]), (partner, sift)):
+                    fallback[image] = FallbackKeypoints(image=image, xy_px=kind.xy_px, rgb=kind.rgb)
+                num_fallback += 1
+        parts.append(edge)
+    graph = ViewGraph.concatenate(parts)
+    return Outputs(view_graph=graph, fallback=tuple(fallback.values()), num_fallback=num_fallback)
+
+
+def _matched(
+    inputs: Inputs,
+    partner: int,
+    overlap: float,
+    features: Features,
+    prepared: Descriptors,
+    others: Features,
+    params: Params,
+) -> ViewGraph:
+    """Return the view graph of one pair, matched by features of one kind."""
+    first, second = inputs.photos[inputs.image], inputs.photos[partner]
+    matches, distinctiveness = _matches(
+        features, prepared, others, first, second, params.ratio, may_be_apart=not np.isfinite(overlap)
+    )
+    two_view = verify(
+        features.xy_px[matches[:, 0]],
+        others.xy_px[matches[:, 1]],
+        _pinhole(first),
+        _pinhole(second),
+        threshold_px=float(params.ransac_threshold or _threshold_px(first, second, overlap)),
+        confidence=float(params.confidence),
+        min_inliers=params.min_inliers,
+        prior=_prior(inputs.reference, inputs.image, partner),
+    )
+    inliers = matches[two_view.is_inlier]
+    coverage = min(
+        grid_coverage(features.xy_px[inliers[:, 0]], first.width_px, first.height_px),
+        grid_coverage(others.xy_px[inliers[:, 1]], second.width_px, second.height_px),
+    )
+    return _edge(inputs.image, partner, matches, distinctiveness, coverage, two_view, params)
+
+
+def _may_fall_back(inputs: Inputs, partner: int, features: Features, others: Features, params: Params) -> bool:
+    """Whether a failed pair has ORB features and a ground sample distance that is known and coarse enough."""
+    if features.detector != "orb" or others.detector != "orb":
+        return False
+    images = [inputs.image, partner]
+    focal_px = np.array([inputs.photos[i].focal_px or np.nan for i in images])
+    gsd_m = float(np.mean(inputs.reference.height_above_ground_m[images] / focal_px))
+    return gsd_m > params.fallback_gsd  # not where it is NaN
 
 
 def _matches(

@@ -2,7 +2,8 @@
 
 Matching finds a point in two images, by one descriptor against thousands. Where the poses foretell its pixel within a
 few px, only the few features there compete, and a match that failed the ratio test or the mutual check is found after
-all. A feature that belongs to another track joins the two tracks, if no image sees both.
+all. A feature that belongs to another track joins the two tracks, if no image sees both. Tracks of keypoints without a
+descriptor among the features, which an image may have behind them, stay as they are.
 
 A found feature's descriptor must be as near to one of the track's as the features of matched pairs are to each other:
 the limit is the 90% quantile of their distances. Whether the found observations fit is for the adjustment to judge,
@@ -59,9 +60,13 @@ def complete_tracks(
 
 @dataclass(frozen=True)
 class _Known:
-    """The descriptors of each point's first and last observation, and how near those of one point are."""
+    """The descriptors of each point's first and last observation, and how near those of one point are.
+
+    `is_described`: both are there.
+    """
 
     descriptors: UInt8[np.ndarray, "points 2 length"]
+    is_described: Bool[np.ndarray, " points"]
     is_binary: bool
     limit: float
 
@@ -72,6 +77,7 @@ class _Known:
         starts = np.searchsorted(tracks.track_index, block.track_index)
         ends = np.searchsorted(tracks.track_index, block.track_index, side="right") - 1
         descriptors, is_binary = None, False
+        is_described = np.ones(block.num_points, bool)
         for image in np.unique(tracks.image_index[np.concatenate([starts, ends])]):
             found = features[int(image)]
             if descriptors is None:
@@ -79,11 +85,14 @@ class _Known:
                 is_binary = found.detector != "sift"
             for slot, rows in enumerate((starts, ends)):
                 here = np.flatnonzero(tracks.image_index[rows] == image)
+                has_one = tracks.feature_index[rows[here]] < found.num_keypoints
+                is_described[here[~has_one]] = False
+                here = here[has_one]
                 descriptors[here, slot] = found.descriptors[tracks.feature_index[rows[here]]]
-        if descriptors is None or len(descriptors) < _LEAST_PAIRS:
+        if descriptors is None or is_described.sum() < _LEAST_PAIRS:
             return None
-        between = _distances(descriptors[:, 0], descriptors[:, 1], is_binary)
-        return _Known(descriptors, is_binary, float(np.quantile(between, _QUANTILE)))
+        between = _distances(descriptors[is_described, 0], descriptors[is_described, 1], is_binary)
+        return _Known(descriptors, is_described, is_binary, float(np.quantile(between, _QUANTILE)))
 
 
 def _links_in(
@@ -100,7 +109,8 @@ def _links_in(
     found = features[image]
     in_image = np.flatnonzero(tracks.image_index == image)
     owner = np.full(found.num_keypoints, -1)
-    owner[tracks.feature_index[in_image]] = tracks.track_index[in_image]
+    described = in_image[tracks.feature_index[in_image] < found.num_keypoints]
+    owner[tracks.feature_index[described]] = tracks.track_index[described]
     # a keypoint of several orientations stands there several times: all of them belong to the track of one
     place = np.unique(found.xy_px, axis=0, return_inverse=True)[1].reshape(-1)
     of_place = np.full(place.max(initial=-1) + 1, -1)
@@ -109,7 +119,7 @@ def _links_in(
 
     sees = np.zeros(tracks.num_tracks, bool)
     sees[tracks.track_index[in_image]] = True
-    points = np.flatnonzero(~sees[block.track_index])
+    points = np.flatnonzero(~sees[block.track_index] & known.is_described)
     pixel = _pixels(block, row, points)
     size = np.array([photos[image].width_px, photos[image].height_px])
     inside = np.isfinite(pixel).all(axis=1) & ((pixel >= 0) & (pixel <= size)).all(axis=1)

@@ -1,4 +1,4 @@
-"""The command line: `solve`, `info` and `synthetic`; it parses, calls and prints, and does no maths of the adjustment.
+"""The command line: `run`, `simulate`, `solve`, `info`, `synthetic`; it parses, calls and prints, and does no maths.
 
 `_main` parses, with one module behind each command; `_options` holds what `solve` takes. jax, numpy and scipy are
 loaded by the command's own module, so that `--help` and a mistyped option answer at once (0.2 s, nearly all of it the

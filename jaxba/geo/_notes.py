@@ -17,8 +17,8 @@ SCALE_WORTH_SAYING = 1e-3
 def frame_notes(frame: LocalFrame, *, is_proposed: bool) -> tuple[str, ...]:
     """Return which CRS the results go to, how it was found, and how well its datum is reached from WGS 84."""
     crs = CRS(frame.crs)
-    how = "proposed, since none was given (crs.target_crs sets another)" if is_proposed else "as given"
-    notes = [f"Results go to {describe(crs)}, in {frame.unit}, {how}."]
+    how = "proposed, since none was given (--crs sets another)" if is_proposed else "as given"
+    notes = [f"Results go to {describe(crs)}, unit {frame.unit}, {how}."]
     place = frame.longitude_deg, frame.latitude_deg
     notes += operation_notes(f"{describe(crs)}", horizontal_operation(crs, *place))
     scale = grid_scale(crs, *place)

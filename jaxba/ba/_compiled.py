@@ -5,6 +5,7 @@ are apart. jax's persistent cache, where it is switched on, keeps the result acr
 """
 
 import functools
+import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -37,6 +38,9 @@ def compiled(solver: AbstractSchurSolver, unknowns: Unknowns, system: System, pl
     return _compile(solver, structure, shapes)
 
 
+_SMALL = 3_000_000  # entries of all arrays
+
+
 @functools.lru_cache(maxsize=_KEPT)
 def _compile(solver: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]) -> Compiled:
     arguments = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
@@ -57,7 +61,9 @@ def _compile(solver: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tu
         jax.jit(init).lower(unknowns, system),
         jax.jit(plain_cost).lower(plain, unknowns),
     )
-    options = compiler_options()
+    # large programs run long enough for the optimisations, and with the fast options one of 500 images has hung
+    small = sum(math.prod(shape) for shape, _ in shapes) < _SMALL
+    options = compiler_options() if small else {}
     with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
         of_step, of_init, of_cost = pool.map(lambda one: one.compile(compiler_options=options), lowered)
     return Compiled(init=of_init, step=of_step, cost=of_cost)

@@ -119,7 +119,9 @@ def unregistered(photos: Sequence[Photo], tracks: Tracks, block: Block, reasons:
             if component is tracks.components[0]:
                 left[image] = f"{reasons.get(image, 'no pose was found')}; fly more overlap there."
             elif len(component) == 1:
-                left[image] = "no edge of the view graph joins it with another photo: too little overlap or texture there."
+                left[image] = (
+                    "no edge of the view graph joins it with another photo: too little overlap or texture there."
+                )
             else:
                 left[image] = (
                     f"in a group of {len(component)} photos that no edge joins with the largest group of "

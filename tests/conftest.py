@@ -1,5 +1,6 @@
 """Every test runs in float64, with the shapes and types of each annotated function and class checked at run time."""
 
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,3 +34,16 @@ def _quick_compilation(request: pytest.FixtureRequest) -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", request.path.stem not in _LARGE)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+    _unload_programs()
+
+
+def _unload_programs() -> None:
+    """Forget what jax has compiled, once it is much.
+
+    A compiled program holds several memory mappings, of which Linux grants a process 65,530; beyond them the compiler
+    waits for ever.
+    """
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+        jax.clear_caches()
+        gc.collect()

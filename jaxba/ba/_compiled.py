@@ -61,7 +61,7 @@ def _compile(solver: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tu
         jax.jit(init).lower(unknowns, system),
         jax.jit(plain_cost).lower(plain, unknowns),
     )
-    # large programs run long enough for the optimisations, and with the fast options one of 500 images has hung
+    # the steps of a large program run long enough to pay for the optimisations
     small = sum(math.prod(shape) for shape, _ in shapes) < _SMALL
     options = compiler_options() if small else {}
     with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core

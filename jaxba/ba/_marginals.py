@@ -23,6 +23,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxba.ba._compiler import fast_jit
 from jaxba.ba._factor import factor_solve, factorise
 from jaxba.ba._linearise import Linearisation, linearise
 from jaxba.ba._plan import Plan
@@ -51,7 +52,7 @@ class Marginals(eqx.Module):
     num_rows: Int[Array, ""]
 
 
-@eqx.filter_jit
+@fast_jit
 def marginals(system: System, plan: Plan, unknowns: Unknowns, damping: Float[Array | np.ndarray, ""]) -> Marginals:
     """Return the marginals, of a system damped by `damping * diag(J^T J)`."""
     model = linearise(system, unknowns)

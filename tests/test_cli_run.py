@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from jaxba.cli import main
-from jaxba.cli._run import _Progress
+from jaxba.cli._run import _Progress, _result_rows
 from jaxba.pipeline import NAMES, Event
 
 sys.path.append(str(Path(__file__).parent / "pipeline"))
@@ -146,3 +146,11 @@ def test_simulate_writes_a_survey_and_says_what(cli: Cli, tmp_path: Path):
     (tmp_path / "other" / "letter.txt").touch()
     code, out, err = cli("simulate", tmp_path / "other")
     assert code == 2 and "is not empty and holds no simulated survey" in err
+
+
+def test_the_fit_to_positions_without_heights_is_told_of_the_other_axes():
+    facts = {
+        "images": 4, "photos": 4, "points": 9, "points_seen_thrice": 5, "observations": 30, "median_px": 0.2,
+        "inlier_rate": 0.99, "gnss_rms_m": [1.25, 2.5, None], "num_gnss": 4, "findings": [],
+    }  # fmt: skip
+    assert ("GNSS fit", "RMS 1.25, 2.50 m east, north over 4 positions") in _result_rows(facts)

@@ -1,5 +1,6 @@
 """`jaxba run`: the pipeline with its progress, then what a surveyor wants to know of the result."""
 
+import math
 import re
 import shutil
 import sys
@@ -150,10 +151,10 @@ def _result_rows(adjust: dict[str, Any]) -> list[tuple[str, str]]:
         ("error", f"median {adjust['median_px']:.2f} px, {adjust['inlier_rate']:.1%} inliers"),
     ]
     if adjust["gnss_rms_m"] is not None:
-        east, north, up = adjust["gnss_rms_m"]
-        rows.append(
-            ("GNSS fit", f"RMS {east:.2f}, {north:.2f}, {up:.2f} m east, north, up over {adjust['num_gnss']} positions")
-        )
+        axes = zip(("east", "north", "up"), adjust["gnss_rms_m"], strict=True)
+        used = {axis: rms for axis, rms in axes if rms is not None and math.isfinite(rms)}  # heights may not be used
+        figures = ", ".join(f"{rms:.2f}" for rms in used.values())
+        rows.append(("GNSS fit", f"RMS {figures} m {', '.join(used)} over {adjust['num_gnss']} positions"))
     for label, finding in zip(["findings"] + [""] * len(adjust["findings"]), adjust["findings"], strict=False):
         rows.append((label, finding))
     return rows

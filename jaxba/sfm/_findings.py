@@ -291,10 +291,11 @@ def _intrinsics(block: Block, start: Block, photos: Sequence[Photo]) -> list[str
 
 def _positions(block: Block, sigmas: Uncertainty, reference: Reference, photos: Sequence[Photo]) -> list[str]:
     std = sigmas.position_std_m
-    if not np.isfinite(std).any():
+    known = np.isfinite(std).all(axis=0)  # not the axes in which no position is measured
+    if not known.any():
         return []
     found = []
-    largest = std.max(axis=1)
+    largest = std[:, known].max(axis=1)
     middle = float(np.median(largest))
     weak = np.flatnonzero(largest > max(5 * middle, 0.02))
     if len(weak):

@@ -141,3 +141,16 @@ def test_what_the_rounds_left_out_is_told(adjusted: Adjusted, survey: Simulated)
 def test_sigmas_of_a_single_receiver_are_explained(adjusted: Adjusted, survey: Simulated) -> None:
     plain = replace(survey.reference, std_m=np.full((12, 3), 3.0))
     assert "up to their own sigma of 3.0 m horizontally" in _findings(adjusted, survey, plain)
+
+
+def test_position_sigmas_are_those_of_the_axes_that_were_measured(adjusted: Adjusted, survey: Simulated) -> None:
+    without_heights = replace(survey.reference, std_m=np.full(survey.reference.std_m.shape, (3.0, 3.0, np.inf)))
+    sigmas = Uncertainty(
+        np.full((adjusted.block.num_images, 3), (0.02, 0.03, np.nan)),
+        np.full((adjusted.block.num_points, 3), (0.05, 0.05, np.nan)),
+        np.zeros(adjusted.block.camera_parameters.shape),
+        1.0,
+    )
+    fit = gnss_fit(adjusted.block, without_heights)
+    text = "\n".join(findings(adjusted, survey.block, sigmas, fit, without_heights, survey.photos))
+    assert "Position sigmas (median 0.03 m)" in text and "nan" not in text

@@ -321,3 +321,26 @@ def test_compilation_cache_is_in_the_users_folder_if_that_can_be(tmp_path: Path,
     before, after = run.stdout.split()
     assert after == expected
     assert before == ("None" if case != "jax's own variable" else expected)  # imports alone set nothing
+
+
+def test_gradcheck_prints_a_table_and_exits_by_its_tolerance(cli: Cli, tmp_path: Path):
+    path = tmp_path / "tile.npz"
+    jaxba.write_tile(path, small_survey().problem)
+    code, out, _ = cli("gradcheck", path, "--fix", "intrinsics", "--loss", "cauchy", "--f-scale", 2)
+    assert code == 0 and "Derivatives of the optimum are within 1e-05 of central differences." in out
+    rows = {line.split("  ")[0] for line in out.splitlines()}
+    assert {"pixels", "pixel sigmas", "loss scale", "position xyz"} <= rows
+    code, out, _ = cli("gradcheck", path, "--fix", "intrinsics", "--loss", "cauchy", "--tolerance", 1e-30, "--json")
+    found = json.loads(out)
+    assert code == 1 and not found["passed"] and found["rows"][0]["name"] == "pixels"
+
+
+def test_gradcheck_refuses_a_block_without_gauge(cli: Cli, tmp_path: Path):
+    path = tmp_path / "tile.npz"
+    jaxba.write_tile(path, small_survey(gnss_std_m=None).problem)
+    code, _, err = cli("gradcheck", path)
+    assert code == 2 and "problem has no gauge" in err and "Add a position prior" in err
+
+
+def small_survey(**options: object) -> jaxba.synthetic.Survey:
+    return jaxba.synthetic.uav_block(4, seed=1, camera=jaxba.SimplePinhole(3600.0, 2736.0, 1824.0), **options)

@@ -1,5 +1,6 @@
 """The solver: problem, residual groups, normal equations, Schur reduction, solve."""
 
+from jaxba.ba._check_gradients import GradientCheck, GradientRow, check_gradients
 from jaxba.ba._covariance import Covariance, covariance
 from jaxba.ba._gauge import free_gauge
 from jaxba.ba._plan import Plan, make_plan
@@ -10,6 +11,7 @@ from jaxba.ba._rows import Rows, Step, Unknowns
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt, residuals
+from jaxba.ba._tune import Tuned, tune
 from jaxba.ba.groups import (
     PRIORS,
     AttitudePrior,
@@ -26,6 +28,8 @@ __all__ = [
     "ControlPointPrior",
     "Covariance",
     "Free",
+    "GradientCheck",
+    "GradientRow",
     "GroupErrors",
     "HistoryStep",
     "IntrinsicsPrior",
@@ -42,7 +46,9 @@ __all__ = [
     "SchurLevenbergMarquardt",
     "Solution",
     "Step",
+    "Tuned",
     "Unknowns",
+    "check_gradients",
     "covariance",
     "free_gauge",
     "make_plan",
@@ -51,4 +57,5 @@ __all__ = [
     "residuals",
     "solve",
     "solve_and_reject",
+    "tune",
 ]

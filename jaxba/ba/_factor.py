@@ -33,6 +33,51 @@ class Solved(NamedTuple):
     iterations: Int[Array, ""]
 
 
+class Factored(NamedTuple):
+    """The reduced system factored for any number of right-hand sides.
+
+    - `images`: factor of A. `through`: F = A^-1 B. `corner`: G = C - B^T F.
+    """
+
+    images: tuple[Array, ...]
+    through: Float[Array, "images block border"]
+    corner: Float[Array, "border border"]
+
+
+def factor_reduced(system: System, reduced: Reduced) -> Factored:
+    """Factor the reduced system; not finite where A is not positive definite."""
+    images = factorise(system, reduced)
+    if not reduced.corner.shape[0]:
+        return Factored(images, reduced.border, reduced.corner)
+    through, _ = factor_solve(system, reduced, images, reduced.border)
+    corner = reduced.corner - jnp.einsum("mbg,mbh->gh", reduced.border, through)
+    return Factored(images, through, (corner + corner.T) / 2)
+
+
+def solve_factored(system: System, reduced: Reduced, factored: Factored, rhs: ReducedVector) -> ReducedVector:
+    """Return S^-1 rhs."""
+    images = factor_solve(system, reduced, factored.images, rhs.images[..., None])[0][..., 0]
+    if not reduced.corner.shape[0]:
+        return ReducedVector(images, rhs.border)
+    border_rhs = rhs.border - jnp.einsum("mbg,mb->g", reduced.border, images)
+    border = box_minimum(factored.corner, border_rhs, None, None)
+    return ReducedVector(images - jnp.einsum("mbg,g->mb", factored.through, border), border)
+
+
+def smallest_pivot(system: System, reduced: Reduced, factored: Factored) -> Float[Array, ""]:
+    """Return the smallest pivot over what it was before anything was eliminated: the inverse of the largest inflation.
+
+    Not positive, or NaN, where the system is not positive definite; of A's own blocks alone with conjugate gradients.
+    """
+    before = jnp.diagonal(reduced.diagonal, axis1=1, axis2=2).reshape(-1)
+    ratios = [jnp.diagonal(factored.images[0], axis1=-2, axis2=-1).reshape(-1) ** 2 / before]
+    if reduced.corner.shape[0]:
+        scale = 1 / jnp.sqrt(jnp.diagonal(reduced.corner))
+        root = jnp.linalg.cholesky(factored.corner * scale[:, None] * scale)
+        ratios.append(jnp.diagonal(root) ** 2)
+    return jnp.min(jnp.concatenate(ratios))
+
+
 def solve_reduced(
     system: System,
     reduced: Reduced,
@@ -61,7 +106,7 @@ def factorise(system: System, reduced: Reduced) -> tuple[Array, ...]:
     if system.shape.linear_solver == "banded":
         return _factor_banded(_panels(system, reduced))
     matrix = reduced.diagonal if system.shape.linear_solver == "cg" else dense_images(system, reduced)
-    return (lax.linalg.cholesky(matrix, symmetrize_input=False),)
+    return (_cholesky(matrix),)
 
 
 def factor_solve(
@@ -73,6 +118,22 @@ def factor_solve(
     flat = rhs.reshape(-1, rhs.shape[-1])
     solution = _solve_banded(factor, flat) if len(factor) == 2 else _solve_cholesky(factor[0], flat)
     return solution.reshape(rhs.shape), jnp.array(0)
+
+
+@jax.custom_jvp
+def _cholesky(matrix: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]:
+    """Return L of a matrix whose lower triangle alone is read."""
+    return lax.linalg.cholesky(matrix, symmetrize_input=False)
+
+
+@_cholesky.defjvp
+def _cholesky_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    # dL = L lower(L^-1 dA L^-T), half of its diagonal (Murray 2016); jax's own rule reads the upper triangle of dA
+    root, lower = _cholesky(*primals), jnp.tril(tangents[0])
+    change = lower + jnp.swapaxes(jnp.tril(lower, -1), -1, -2)
+    half = lax.linalg.triangular_solve(root, change, left_side=True, lower=True)
+    both = lax.linalg.triangular_solve(root, half, left_side=False, lower=True, transpose_a=True)
+    return root, root @ (jnp.tril(both) - jnp.tril(both) * jnp.eye(both.shape[-1], dtype=both.dtype) / 2)
 
 
 def _solve_cholesky(root: Float[Array, "*m n n"], rhs: Float[Array, "*m n columns"]) -> Float[Array, "*m n columns"]:
@@ -110,7 +171,7 @@ def box_minimum(
         scaled = matrix * scale[:, None] * scale[None] * (free[:, None] & free[None])
         scaled += jnp.diag(jnp.where(free, 0.0, 1.0))
         right = jnp.where(free, (rhs - matrix @ jnp.where(held, values, 0.0)) * scale, 0.0)
-        root = lax.linalg.cholesky(scaled, symmetrize_input=False)
+        root = _cholesky(scaled)
         x = jax.scipy.linalg.cho_solve((root, True), right) * scale
         return jnp.where(held, values, x)
 
@@ -165,7 +226,7 @@ def _factor_banded(panels: Float[Array, "panels panel band"]) -> tuple[Array, Ar
         window = window.at[i * size : (i + 1) * size, : (i + 1) * size].set(panels[i][:, band - (i + 1) * size :])
 
     def factor(window: Array, panel: Array) -> tuple[Array, tuple[Array, Array]]:
-        root = lax.linalg.cholesky(window[:size, :size], symmetrize_input=False)
+        root = _cholesky(window[:size, :size])
         under = lax.linalg.triangular_solve(root, window[size:, :size], left_side=False, lower=True, transpose_a=True)
         moved = jnp.pad(window[size:, size:] - under @ under.T, ((0, size), (0, size)))
         # the panel of rows that enters the window as this one leaves it

@@ -10,7 +10,6 @@ The derivatives themselves are never stored: they are computed a few thousand ro
 rows they would take 42 MB, and to touch that much fresh memory costs more time than the derivatives.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -22,9 +21,16 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._plan import ROW_RUN
-from jaxba.ba._priors import block_products, block_transpose, product, robust_rows, transpose_product
+from jaxba.ba._priors import (
+    PriorBlocks,
+    add_products,
+    block_products,
+    block_transpose,
+    robust_rows,
+    transpose_product,
+)
 from jaxba.ba._robust import reweighting
-from jaxba.ba._rows import Rows, Step, Unknowns, rows_of, segments, sum_components
+from jaxba.ba._rows import Step, Unknowns, rows_of, segments, sum_components
 from jaxba.ba._system import System
 from jaxba.ba.groups import Reprojection
 
@@ -37,14 +43,15 @@ class Linearisation(eqx.Module):
     - `point_products`: the points' 3x3 blocks.
     - `point_shared`: each point's block with the shared intrinsics, all cameras side by side; none if they are own
       ones.
+    - `prior_blocks`: of the priors; the points' blocks hold theirs already.
     - `gradient`, `diagonal`: J^T r and the diagonal of J^T J, of all groups.
     """
 
-    image_products: Float[Array, "images columns columns"]
+    image_products: Float[Array, "images columns1 columns"]
     w: Float[Array, "rows 3 block"]
     point_products: Float[Array, "points 3 3"]
     point_shared: Float[Array, "points 3 shared"]
-    prior_rows: tuple[Rows, ...]
+    prior_blocks: PriorBlocks
     gradient: Step
     diagonal: Step
 
@@ -107,24 +114,44 @@ def linearise(system: System, unknowns: Unknowns, bend: Float[Array, ""] | float
 
     - `bend`: how much of a robust loss's curvature is used, 0 to 1; see `_robust.py`.
     """
-    shape = system.shape
-    dtype = unknowns.points.dtype
-    bend = jnp.asarray(bend, dtype)
-    k, cameras = shape.num_refined, shape.num_shared_cameras
-    first_point = 6 + k + 1
+    bend = jnp.asarray(bend, unknowns.points.dtype)
+    first_point = 6 + system.shape.num_refined + 1
 
-    def body(carry: tuple[Array, Array], part: Reprojection) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        of_points, of_shared = carry
+    def products(part: Reprojection) -> tuple[Array, Array]:
         rows = part.rows(unknowns, lambda residual: reweighting(residual, system.loss, bend))
         rows = _masked_columns(rows, part, system)
         by_lane = jnp.swapaxes(rows, 2, 3)
         flat = by_lane.reshape(by_lane.shape[0], 2 * ROW_RUN, -1)[:, :, :first_point]
-        image_products = jnp.einsum("rka,rkb->rab", flat, flat)
-
+        of_images = jnp.einsum("rka,rkb->rab", flat, flat)
         pixel = jnp.moveaxis(by_lane, 1, 2).reshape(-1, 2, by_lane.shape[-1])
-        of_point = (
+        of_points = (
             pixel[:, 0, first_point:, None] * pixel[:, 0, None] + pixel[:, 1, first_point:, None] * pixel[:, 1, None]
         )
+        return of_images, of_points
+
+    zero = jax.tree.map(jnp.zeros_like, system.free)
+    blocks, gradient = PriorBlocks.zeros(zero), zero
+    for prior in system.priors:
+        rows = robust_rows(system, prior, unknowns, bend)
+        blocks = add_products(blocks, rows)
+        gradient = jax.tree.map(jnp.add, gradient, transpose_product(rows, rows.residual, zero))
+    return assemble(system, products, blocks, gradient)
+
+
+def assemble(
+    system: System, products: Callable[[Reprojection], tuple[Array, Array]], blocks: PriorBlocks, gradient: Step
+) -> Linearisation:
+    """Return the equations from the products of pieces of the observations, and the priors' blocks and gradient.
+
+    `products` returns those of each run among the columns of its image, and of each row the point's three times all
+    columns: pose, refined intrinsics, residual, point.
+    """
+    shape, dtype = system.shape, blocks.points.dtype
+    k, cameras = shape.num_refined, shape.num_shared_cameras
+
+    def body(carry: tuple[Array, Array], part: Reprojection) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        of_points, of_shared = carry
+        image_products, of_point = products(part)
         index = part.point_index.reshape(-1)
         of_points = of_points.at[index].add(of_point[:, :, 6 + k :], mode="promise_in_bounds")
         if cameras:
@@ -140,33 +167,34 @@ def linearise(system: System, unknowns: Unknowns, bend: Float[Array, ""] | float
     (of_points, of_shared), (run_products, w) = _scan_chunks(system, body, start)
     image_products = sum_runs(system, run_products)
     of_shared = jnp.swapaxes(of_shared.reshape(shape.num_points, cameras, 3, k), 1, 2)
-    point_shared = of_shared.reshape(shape.num_points, 3, cameras * k)
+    point_products = of_points[:, :, 1:] + blocks.points
 
-    zero = jax.tree.map(jnp.zeros_like, system.free)
-    refined = zero.intrinsics.at[:, refined_columns(system)]
-    squares = jnp.diagonal(image_products, axis1=1, axis2=2)
-    to_cameras = functools.partial(sum_cameras, system)
+    def diagonal_of(matrix: Array) -> Array:
+        return jnp.diagonal(matrix, axis1=1, axis2=2)
+
+    refined, squares = refined_columns(system), diagonal_of(image_products[:, : 6 + k, : 6 + k])
+    of_cameras = sum_cameras(system, image_products[:, 6 : 6 + k, 6 + k])
     gradient = Step(
-        poses=image_products[:, :6, 6 + k],
-        intrinsics=refined.set(to_cameras(image_products[:, 6 : 6 + k, 6 + k])),
-        lever_arm=zero.lever_arm,
-        points=of_points[:, :, 0],
+        poses=gradient.poses + image_products[:, :6, 6 + k],
+        intrinsics=jnp.asarray(gradient.intrinsics).at[:, refined].add(of_cameras),
+        lever_arm=gradient.lever_arm,
+        points=gradient.points + of_points[:, :, 0],
     )
     diagonal = Step(
-        poses=squares[:, :6],
-        intrinsics=refined.set(to_cameras(squares[:, 6 : 6 + k])),
-        lever_arm=zero.lever_arm,
-        points=jnp.diagonal(of_points[:, :, 1:], axis1=1, axis2=2),
+        poses=diagonal_of(blocks.poses) + squares[:, :6],
+        intrinsics=diagonal_of(blocks.intrinsics).at[:, refined].add(sum_cameras(system, squares[:, 6:])),
+        lever_arm=jnp.diagonal(blocks.lever_arm),
+        points=diagonal_of(point_products),
     )
-    point_products = of_points[:, :, 1:]
-    prior_rows = tuple(robust_rows(system, prior, unknowns, bend) for prior in system.priors)
-    for extra in prior_rows:
-        gradient = jax.tree.map(jnp.add, gradient, transpose_product(extra, extra.residual, zero))
-        squared = jax.tree.map(lambda a: a**2 if jnp.issubdtype(a.dtype, jnp.floating) else a, extra)
-        diagonal = jax.tree.map(jnp.add, diagonal, transpose_product(squared, jnp.ones_like(extra.residual), zero))
-        if extra.point is not None:
-            point_products += block_products(extra.point, shape.num_points)
-    return Linearisation(image_products, w, point_products, point_shared, prior_rows, gradient, diagonal)
+    return Linearisation(
+        image_products,
+        w,
+        point_products,
+        of_shared.reshape(shape.num_points, 3, cameras * k),
+        blocks,
+        gradient,
+        diagonal,
+    )
 
 
 def curvature(system: System, model: Linearisation, step: Step) -> Float[Array, ""]:
@@ -180,10 +208,11 @@ def curvature(system: System, model: Linearisation, step: Step) -> Float[Array, 
     if model.point_shared.shape[-1]:
         of_points += model.point_shared @ refined.reshape(-1)
     total += 2 * jnp.vdot(step.points, of_points)
-    # the points' blocks hold the priors on points already
-    for rows in model.prior_rows:
-        alone = Rows(rows.residual, rows.pose, rows.intrinsics, rows.lever_arm)
-        total += jnp.sum(product(alone, step) ** 2)
+    blocks = model.prior_blocks  # the points' blocks hold the priors on points already
+    total += jnp.einsum("ma,mab,mb->", step.poses, blocks.poses, step.poses)
+    total += jnp.einsum("ca,cab,cb->", step.intrinsics, blocks.intrinsics, step.intrinsics)
+    total += jnp.einsum("a,ab,b->", step.lever_arm, blocks.lever_arm, step.lever_arm)
+    total += 2 * jnp.einsum("ma,mab,b->", step.poses, blocks.poses_lever_arm, step.lever_arm)
     return total
 
 

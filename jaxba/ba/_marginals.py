@@ -24,9 +24,10 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._compiler import fast_jit
-from jaxba.ba._factor import factor_solve, factorise
-from jaxba.ba._linearise import Linearisation, linearise
+from jaxba.ba._factor import factor_reduced, factor_solve
+from jaxba.ba._linearise import linearise
 from jaxba.ba._plan import Plan
+from jaxba.ba._priors import robust_rows
 from jaxba.ba._rows import Unknowns
 from jaxba.ba._schur import Reduced, eliminate_points
 from jaxba.ba._system import System
@@ -61,7 +62,7 @@ def marginals(system: System, plan: Plan, unknowns: Unknowns, damping: Float[Arr
     images = jnp.arange(system.shape.num_images)
     blocks = inverse[images, :, images]
     diagonal = jnp.diagonal(reduced.diagonal, axis1=1, axis2=2)
-    double_cost, num_rows = _sum_of_losses(system, plan, unknowns, model)
+    double_cost, num_rows = _sum_of_losses(system, plan, unknowns)
     return Marginals(
         blocks=blocks,
         border=corner,
@@ -77,8 +78,13 @@ def _inverse(system: System, reduced: Reduced) -> tuple[Array, Array, Array]:
     """Return S^-1: (images block images block), (images block border), (border border)."""
     shape = system.shape
     size = shape.num_images * shape.block
-    factor = factorise(system, reduced)
-    through, corner = _border(system, reduced, factor)
+    factored = factor_reduced(system, reduced)
+    factor, through, corner = factored.images, factored.through, factored.corner
+    if shape.border:
+        scale = 1 / jnp.sqrt(jnp.diagonal(corner))
+        root = jnp.linalg.cholesky(corner * scale[:, None] * scale)
+        half = jax.scipy.linalg.solve_triangular(root, jnp.diag(scale), lower=True)
+        corner = half.T @ half
     cross = -jnp.einsum("mbg,gh->mbh", through, corner)
 
     def piece(carry: None, column: Array) -> tuple[None, Array]:
@@ -93,18 +99,6 @@ def _inverse(system: System, reduced: Reduced) -> tuple[Array, Array, Array]:
     _, inverse = jax.lax.scan(piece, None, jnp.arange(size + -size % _COLUMNS).reshape(-1, _COLUMNS))
     inverse = inverse.reshape(-1, size)[:size]
     return inverse.reshape(shape.num_images, shape.block, shape.num_images, shape.block), cross, corner
-
-
-def _border(system: System, reduced: Reduced, factor: tuple[Array, ...]) -> tuple[Array, Array]:
-    """Return F and G^-1."""
-    if not system.shape.border:
-        return reduced.border, reduced.corner
-    through, _ = factor_solve(system, reduced, factor, reduced.border)
-    corner = reduced.corner - jnp.einsum("mbg,mbh->gh", reduced.border, through)
-    scale = 1 / jnp.sqrt(jnp.diagonal(corner))
-    root = jnp.linalg.cholesky((corner + corner.T) / 2 * scale[:, None] * scale)
-    half = jax.scipy.linalg.solve_triangular(root, jnp.diag(scale), lower=True)
-    return through, half.T @ half
 
 
 def _point_covariances(
@@ -151,7 +145,7 @@ def _lower_triangle(root: Float[Array, "points 6"]) -> Float[Array, "points 3 3"
     return jnp.zeros((root.shape[0], 3, 3), root.dtype).at[:, rows, columns].set(root)
 
 
-def _sum_of_losses(system: System, plan: Plan, unknowns: Unknowns, model: Linearisation) -> tuple[Array, Array]:
+def _sum_of_losses(system: System, plan: Plan, unknowns: Unknowns) -> tuple[Array, Array]:
     """Return twice the cost of the components that depend on something free, and their number."""
     group, free = system.reprojection, system.free
     of_image = free.poses[:, 0] + jnp.sum(free.intrinsics[jnp.asarray(group.camera_index)], axis=1)
@@ -159,8 +153,8 @@ def _sum_of_losses(system: System, plan: Plan, unknowns: Unknowns, model: Linear
     depends = (anything > 0) & (jnp.asarray(plan.row_observation) >= 0)
     squared = jnp.sum(group.residual(unknowns)[0].reshape(2, -1) ** 2, axis=0)
     total, number = jnp.sum(system.loss(jnp.where(depends, squared, 0.0))), 2 * jnp.sum(depends)
-    for prior, rows in zip(system.priors, model.prior_rows, strict=True):
-        residual = prior.residual(unknowns)
+    for prior in system.priors:
+        residual, rows = prior.residual(unknowns), robust_rows(system, prior, unknowns, jnp.zeros(()))
         depends = jnp.zeros(residual.shape, bool)
         blocks = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
         for derivative in [*blocks, *([] if rows.lever_arm is None else [rows.lever_arm])]:

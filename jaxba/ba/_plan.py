@@ -21,6 +21,7 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 from jaxtyping import Int
 from scipy import sparse
@@ -90,21 +91,21 @@ _NOTHING = Shape(
 class Plan(eqx.Module):
     """Index arrays of a problem's structure; `shape` is static."""
 
-    image_order: Int[np.ndarray, " images"]
+    image_order: Int[Array | np.ndarray, " images"]
     """Original index of each image, in solver order (without padding)."""
-    point_order: Int[np.ndarray, " points"]
-    camera_order: Int[np.ndarray, " cameras"]
+    point_order: Int[Array | np.ndarray, " points"]
+    camera_order: Int[Array | np.ndarray, " cameras"]
     """Original index of each camera in solver order: that of the images where each has its own."""
-    row_observation: Int[np.ndarray, " rows"]
+    row_observation: Int[Array | np.ndarray, " rows"]
     """Original index of the observation in each row, -1 for padding."""
-    row_image: Int[np.ndarray, " rows"]
-    row_point: Int[np.ndarray, " rows"]
-    pair_first: Int[np.ndarray, "chunks pair_chunk pair_run"]
-    pair_second: Int[np.ndarray, "chunks pair_chunk pair_run"]
+    row_image: Int[Array | np.ndarray, " rows"]
+    row_point: Int[Array | np.ndarray, " rows"]
+    pair_first: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
+    pair_second: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
     """Rows of each pair; the first one's image comes later in the order. Padding is the last row, of weight zero."""
-    pair_block: Int[np.ndarray, " pair_runs"]
-    block_row: Int[np.ndarray, " blocks"]
-    block_column: Int[np.ndarray, " blocks"]
+    pair_block: Int[Array | np.ndarray, " pair_runs"]
+    block_row: Int[Array | np.ndarray, " blocks"]
+    block_column: Int[Array | np.ndarray, " blocks"]
     """Images of each off-diagonal block, row > column; padding repeats the last image in both."""
     shape: Shape = eqx.field(static=True)
 
@@ -240,8 +241,8 @@ def _sweeps(problem: Problem) -> list[Int[np.ndarray, " images"]]:
     """Orders of the images along twelve directions in the plane of the block; none where positions are traced."""
     if isinstance(problem.poses.translation, Tracer) or isinstance(problem.poses.quaternion, Tracer):
         return []
-    rotation = Rotation.from_quat(np.asarray(problem.poses.quaternion), scalar_first=True)
-    center = -rotation.apply(np.asarray(problem.poses.translation), inverse=True)
+    rotation = Rotation.from_quat(np.array(problem.poses.quaternion, float), scalar_first=True)
+    center = -rotation.apply(np.array(problem.poses.translation, float), inverse=True)
     center = np.nan_to_num(center - center.mean(axis=0))
     axes = np.linalg.svd(center, full_matrices=False)[2][:2]
     angles = np.arange(12) * np.pi / 12

@@ -1,5 +1,11 @@
-"""Rows of priors: made robust, masked by what is free, multiplied and summed."""
+"""Rows of priors: made robust, masked by what is free, multiplied and summed.
 
+What the normal equations need of all priors together is one block an image, a camera and a point, the lever arm's, and
+the lever arm's with each image: `PriorBlocks`. No prior couples anything else.
+"""
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -34,15 +40,107 @@ def robust_rows(system: System, prior: AbstractPrior, unknowns: Unknowns, bend: 
     )
 
 
-def product(rows: Rows, step: Step) -> Float[Array, "components rows"]:
-    """Return `J d`."""
-    total = jnp.zeros_like(rows.residual)
-    for block, of_kind in ((rows.pose, step.poses), (rows.intrinsics, step.intrinsics), (rows.point, step.points)):
-        if block is not None:
-            total += jnp.einsum("ckn,nk->cn", block.jacobian, rows_of(of_kind, block.index))
+class PriorBlocks(eqx.Module):
+    """Blocks of J^T J, or of second derivatives, summed over all priors; intrinsics with all their columns."""
+
+    poses: Float[Array, "images 6 6"]
+    intrinsics: Float[Array, "cameras parameters parameters"]
+    lever_arm: Float[Array, "3 3"]
+    poses_lever_arm: Float[Array, "images 6 3"]
+    points: Float[Array, "points 3 3"]
+
+    @staticmethod
+    def zeros(like: Step) -> "PriorBlocks":
+        """Return blocks of zeros for the unknowns of a step."""
+
+        def zeros(kind: Array | np.ndarray, columns: int) -> Array:
+            return jnp.zeros((*kind.shape, columns), kind.dtype)
+
+        return PriorBlocks(
+            poses=zeros(like.poses, 6),
+            intrinsics=zeros(like.intrinsics, like.intrinsics.shape[1]),
+            lever_arm=zeros(like.lever_arm, 3),
+            poses_lever_arm=zeros(like.poses, 3),
+            points=zeros(like.points, 3),
+        )
+
+
+def add_products(blocks: PriorBlocks, rows: Rows) -> PriorBlocks:
+    """Add a prior's J^T J."""
+
+    def square(total: Array, block: Block | None) -> Array:
+        return total if block is None else total + block_products(block, total.shape[0])
+
+    lever_arm, cross = blocks.lever_arm, blocks.poses_lever_arm
     if rows.lever_arm is not None:
-        total += jnp.einsum("ckn,k->cn", rows.lever_arm, step.lever_arm)
-    return total
+        lever_arm += jnp.einsum("cin,cjn->ij", rows.lever_arm, rows.lever_arm)
+        if rows.pose is not None:
+            products = jnp.einsum("cin,cjn->nij", rows.pose.jacobian, rows.lever_arm)
+            cross += segments(products, rows.pose.index, cross.shape[0])
+    return PriorBlocks(
+        square(blocks.poses, rows.pose),
+        square(blocks.intrinsics, rows.intrinsics),
+        lever_arm,
+        cross,
+        square(blocks.points, rows.point),
+    )
+
+
+def add_second_derivatives(
+    blocks: PriorBlocks, system: System, prior: AbstractPrior, unknowns: Unknowns
+) -> PriorBlocks:
+    """Add the second derivatives of a prior's cost, from those of its residual by one image, camera and point a row.
+
+    A row touches at most one of each kind, so a step that all of a kind take together tells every row's derivatives.
+    """
+    touched = prior.rows(unknowns)
+    kinds = [kind for kind in ("pose", "intrinsics", "lever_arm", "point") if getattr(touched, kind) is not None]
+    sizes = [6 if kind == "pose" else unknowns.intrinsics.shape[1] if kind == "intrinsics" else 3 for kind in kinds]
+    places = {kind: slice(sum(sizes[:i]), sum(sizes[: i + 1])) for i, kind in enumerate(kinds)}
+    index = {kind: getattr(touched, kind).index for kind in kinds if kind != "lever_arm"}
+    zero = jax.tree.map(jnp.zeros_like, system.free)
+
+    def residual(together: Array) -> Array:
+        def moved(of_kind: Array | np.ndarray, kind: str) -> Array:
+            return jnp.asarray(of_kind) + together[places[kind]] if kind in places else jnp.asarray(of_kind)
+
+        step = Step(
+            moved(zero.poses, "pose"),
+            moved(zero.intrinsics, "intrinsics"),
+            moved(zero.lever_arm, "lever_arm"),
+            moved(zero.points, "point"),
+        )
+        return prior.residual(unknowns.retract(step))
+
+    start = jnp.zeros(sum(sizes), unknowns.points.dtype)
+    value, by = residual(start), jax.jacfwd(residual)(start)
+    _, slope, bent = prior.loss.derivatives(sum_components(value**2))
+    second = jax.jacfwd(jax.jacfwd(lambda together: jnp.sum(slope * value * residual(together), axis=0)))(start)
+    through = jnp.einsum("cn,cni->ni", value, by)
+    hessian = jnp.einsum("n,cni,cnj->nij", slope, by, by) + second
+    hessian += 2 * bent[:, None, None] * through[:, :, None] * through[:, None]
+    masks = {"pose": system.free.poses, "intrinsics": system.free.intrinsics, "point": system.free.points}
+    for kind, place in places.items():
+        mask = system.free.lever_arm[None] if kind == "lever_arm" else rows_of(masks[kind], index[kind])
+        hessian = hessian.at[:, place].multiply(mask[:, :, None]).at[:, :, place].multiply(mask[:, None])
+
+    def square(total: Array, kind: str) -> Array:
+        if kind not in places:
+            return total
+        return total + segments(hessian[:, places[kind], places[kind]], index[kind], total.shape[0])
+
+    lever_arm, cross = blocks.lever_arm, blocks.poses_lever_arm
+    if "lever_arm" in places:
+        lever_arm += jnp.sum(hessian[:, places["lever_arm"], places["lever_arm"]], axis=0)
+        if "pose" in places:
+            cross += segments(hessian[:, places["pose"], places["lever_arm"]], index["pose"], cross.shape[0])
+    return PriorBlocks(
+        square(blocks.poses, "pose"),
+        square(blocks.intrinsics, "intrinsics"),
+        lever_arm,
+        cross,
+        square(blocks.points, "point"),
+    )
 
 
 def transpose_product(rows: Rows, values: Float[Array, "components rows"], zero: Step) -> Step:

@@ -33,7 +33,8 @@ def reweighting(
     _, slope, curvature = loss.derivatives(squared)
     slope = jnp.maximum(slope, 1e-12)  # a loss that has levelled off leaves a row without weight, not without a shape
     root = jnp.sqrt(slope)
-    alpha = jnp.minimum(1 - jnp.sqrt(jnp.maximum(1 + 2 * curvature * squared / slope, 0.0)), bend)
+    bent = 1 + 2 * curvature * squared / slope
+    alpha = jnp.minimum(1 - jnp.where(bent > 0, jnp.sqrt(jnp.where(bent > 0, bent, 1.0)), 0.0), bend)
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
     unit = [r / length for r in residual]
 

@@ -23,8 +23,8 @@ from jaxtyping import Float
 
 from jaxba.ba._linearise import Linearisation, refined_columns, sum_cameras, sum_runs, w_product
 from jaxba.ba._plan import ROW_RUN
-from jaxba.ba._priors import block_products
-from jaxba.ba._rows import Block, Rows, Step, rows_of, segments
+from jaxba.ba._priors import PriorBlocks
+from jaxba.ba._rows import Step, rows_of, segments
 from jaxba.ba._system import System
 
 
@@ -80,8 +80,7 @@ def eliminate_points(system: System, model: Linearisation, damping: Step) -> Red
     lever = shape.border - num_shared
     border = jnp.pad(border, ((0, 0), (0, 0), (0, lever)))
     corner = jnp.pad(corner, ((0, lever), (0, lever))) + _diagonal_matrix(vector.border)
-    for extra in model.prior_rows:
-        diagonal, border, corner = _add_prior(system, extra, diagonal, border, corner)
+    diagonal, border, corner = _add_priors(system, model.prior_blocks, diagonal, border, corner)
     return Reduced(diagonal, _sum_pairs(system, z), border, corner, root, z, z_shared)
 
 
@@ -217,30 +216,25 @@ def _sum_pairs(system: System, z: Float[Array, "rows 3 block"]) -> Float[Array, 
     )
 
 
-def _add_prior(
+def _add_priors(
     system: System,
-    rows: Rows,
+    blocks: PriorBlocks,
     diagonal: Float[Array, "images block block"],
     border: Float[Array, "images block border"],
     corner: Float[Array, "border border"],
 ) -> tuple[Array, Array, Array]:
-    """Add a prior's `J^T J` over poses, intrinsics and lever arm; no prior couples a point to anything else."""
-    shape = system.shape
-    lever = slice(shape.border - 3, shape.border)
-    if rows.pose is not None:
-        diagonal = diagonal.at[:, :6, :6].add(block_products(rows.pose, shape.num_images))
-    if rows.intrinsics is not None:
-        refined = rows.intrinsics.jacobian[:, refined_columns(system)]
-        products = block_products(Block(rows.intrinsics.index, refined), shape.num_cameras)
-        if shape.own_cameras:
-            diagonal = diagonal.at[:, 6:, 6:].add(products)
-        elif shape.num_refined:
-            corner = _add_cameras(corner, products)
-    if rows.lever_arm is not None and shape.lever_arm:
-        corner = corner.at[lever, lever].add(jnp.einsum("cin,cjn->ij", rows.lever_arm, rows.lever_arm))
-        if rows.pose is not None:
-            products = jnp.einsum("cin,cjn->nij", rows.pose.jacobian, rows.lever_arm)
-            border = border.at[:, :6, lever].add(segments(products, rows.pose.index, shape.num_images))
+    """Add the priors' blocks of poses, intrinsics and lever arm."""
+    shape, refined = system.shape, refined_columns(system)
+    diagonal = diagonal.at[:, :6, :6].add(blocks.poses)
+    of_cameras = blocks.intrinsics[:, refined[:, None], refined]
+    if shape.own_cameras:
+        diagonal = diagonal.at[:, 6:, 6:].add(of_cameras)
+    elif shape.num_refined:
+        corner = _add_cameras(corner, of_cameras)
+    if shape.lever_arm:
+        lever = slice(shape.border - 3, shape.border)
+        corner = corner.at[lever, lever].add(blocks.lever_arm)
+        border = border.at[:, :6, lever].add(blocks.poses_lever_arm)
     return diagonal, border, corner
 
 

@@ -162,7 +162,8 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
             status=status,
             num_steps=state.num_steps + 1,
         )
-        return new, new_state, None
+        # a derivative through the steps takes their lengths, which depend on the values in jumps, as they are
+        return new, jax.lax.stop_gradient(new_state), None
 
     def terminate(
         self, fn: Any, y: Unknowns, args: System, options: Any, state: State, tags: frozenset[object]

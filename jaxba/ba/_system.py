@@ -19,7 +19,7 @@ from jaxba.ba._plan import ROW_RUN, Plan, Shape, bucket
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._rows import Step, Unknowns
 from jaxba.ba.groups import Reprojection
-from jaxba.geometry import AbstractLoss, Pose
+from jaxba.geometry import AbstractLoss, Linear, Pose
 
 
 class System(eqx.Module):
@@ -46,10 +46,10 @@ class System(eqx.Module):
 
 def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = np.float64) -> System:
     """Return the system of a problem under a plan made from the same indices."""
-    xp = _namespace((problem, loss))
+    xp = _namespace((problem, loss, plan))
     shape, observations = plan.shape, problem.observations
     seen = plan.row_observation >= 0
-    source = np.where(seen, plan.row_observation, 0)
+    source = xp.where(seen, plan.row_observation, 0)
     weight = xp.where(seen, 1 / xp.asarray(observations.std_px, dtype)[source], 0.0)
     camera_of_image = _camera_of_image(xp, problem, plan)
     runs = (-1, ROW_RUN)
@@ -88,7 +88,7 @@ def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = n
 
 def initial_unknowns(problem: Problem, plan: Plan, dtype: Any = np.float64) -> Unknowns:
     """Return the problem's start values in the solver's order."""
-    xp = _namespace(problem)
+    xp = _namespace((problem, plan))
     shape = plan.shape
     quaternion = _padded(xp, problem.poses.quaternion, plan.image_order, shape.num_images, 0.0, dtype)
     quaternion = xp.concatenate(
@@ -109,9 +109,9 @@ def initial_unknowns(problem: Problem, plan: Plan, dtype: Any = np.float64) -> U
 
 def restore(unknowns: Unknowns, problem: Problem, plan: Plan) -> Unknowns:
     """Return the unknowns in the problem's own order, without padding."""
-    xp = _namespace(unknowns)
-    image_rank, point_rank = np.argsort(plan.image_order), np.argsort(plan.point_order)
-    camera_rank = np.argsort(plan.camera_order)
+    xp = _namespace((unknowns, plan))
+    image_rank, point_rank = xp.argsort(plan.image_order), xp.argsort(plan.point_order)
+    camera_rank = xp.argsort(plan.camera_order)
     return Unknowns(
         poses=Pose(
             xp.asarray(unknowns.poses.quaternion)[image_rank], xp.asarray(unknowns.poses.translation)[image_rank]
@@ -120,6 +120,12 @@ def restore(unknowns: Unknowns, problem: Problem, plan: Plan) -> Unknowns:
         lever_arm=xp.asarray(unknowns.lever_arm),
         points=xp.asarray(unknowns.points)[point_rank],
     )
+
+
+def without_losses(system: System) -> System:
+    """Return the system as least squares."""
+    linear = tuple(dataclasses.replace(prior, loss=Linear()) for prior in system.priors)
+    return dataclasses.replace(system, loss=Linear(), priors=linear)
 
 
 def is_traced(tree: Any) -> bool:
@@ -149,7 +155,7 @@ def _camera_of_image(xp: Any, problem: Problem, plan: Plan) -> Any:
     return _padded(xp, problem.camera_index, plan.image_order, plan.shape.num_images, 0.0, np.int32)
 
 
-def _padded(xp: Any, values: Any, order: np.ndarray, count: int, fill: float | None, dtype: Any) -> Any:
+def _padded(xp: Any, values: Any, order: Array | np.ndarray, count: int, fill: float | None, dtype: Any) -> Any:
     """Reorder along the first axis and pad to `count`, with a value or with copies of the first entry."""
     ordered = xp.asarray(values, dtype)[order]
     missing = count - len(order)
@@ -161,9 +167,9 @@ def _padded(xp: Any, values: Any, order: np.ndarray, count: int, fill: float | N
 def _reordered(xp: Any, prior: AbstractPrior, plan: Plan, dtype: Any) -> AbstractPrior:
     """Return a prior with its indices in the solver's order, padded to a bucket with rows of infinite sigma."""
     ranks = {
-        "image_index": np.argsort(plan.image_order),
-        "point_index": np.argsort(plan.point_order),
-        "camera_index": np.argsort(plan.camera_order),
+        "image_index": xp.argsort(plan.image_order),
+        "point_index": xp.argsort(plan.point_order),
+        "camera_index": xp.argsort(plan.camera_order),
     }
     changed: dict[str, Any] = {}
     for field in dataclasses.fields(prior):

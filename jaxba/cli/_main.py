@@ -14,7 +14,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.cli._options import SolveOptions
+from jaxba.cli._options import LossName, SolveOptions
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
@@ -64,6 +64,29 @@ def solve(
     from jaxba.cli._solve import run
 
     return run(file, options or SolveOptions())
+
+
+@app.command(
+    help="Check derivatives of the adjusted values against central differences, for every kind of input.\n\n"
+    "Exit codes: 0 within the tolerance, 1 over it, 2 bad input or options."
+)
+def gradcheck(
+    file: _File,
+    /,
+    *,
+    loss: Annotated[LossName, Parameter(help="Robust loss of the reprojections.")] = "linear",
+    f_scale: Annotated[float, Parameter(help="Its scale, in sigmas.")] = 1.0,
+    alpha: Annotated[float | None, Parameter(help="Shape of barron.")] = None,
+    fix: Annotated[tuple[str, ...], Parameter(negative="", show_default=False, help="As in solve.")] = (),
+    bounds: Annotated[tuple[str, ...], Parameter(negative="", show_default=False, help="As in solve.")] = (),
+    tolerance: Annotated[float, Parameter(help="Relative error that a row may have.")] = 1e-5,
+    seed: Annotated[int, Parameter(help="Of the directions.")] = 0,
+    json: Annotated[bool, Parameter(negative="", show_default=False, help="Print one JSON object.")] = False,
+) -> int:
+    from jaxba.cli._gradcheck import run
+
+    options = SolveOptions(loss=loss, f_scale=f_scale, alpha=alpha, fix=fix, bounds=bounds, json=json)
+    return run(file, options, tolerance=tolerance, seed=seed)
 
 
 @app.command(help="Tell sizes, track lengths, connectivity, gauge, priors, and what is free.")

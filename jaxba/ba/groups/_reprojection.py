@@ -22,7 +22,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._rows import Unknowns, rows_of
-from jaxba.geometry import AbstractCamera
+from jaxba.geometry import AbstractCamera, AbstractLoss
 
 Components = Sequence[Array]
 Reweighting = Callable[[Components], tuple[Components, Callable[[Components], Components]]]
@@ -84,6 +84,53 @@ class Reprojection(eqx.Module):
             rows.append(jnp.stack([*turn, *a, *intrinsics, residual[c], *point], axis=1))
         return jnp.stack(rows, axis=1)
 
+    def local_hessian(
+        self, unknowns: Unknowns, loss: AbstractLoss
+    ) -> tuple[Float[Array, "runs 3 3"], tuple[Array, Array, Array], Float[Array, "runs n n1 lanes"]]:
+        """Return R of each run, p = R x + t, and second derivatives of the cost by p and the refined intrinsics.
+
+        The last column is the gradient. With J the derivatives of the residual r and s = |r|^2,
+
+            rho' J^T J + 2 rho'' (J^T r)(J^T r)^T + rho' sum of r_c d2(r_c)
+        """
+        rotation, (x, y, z) = self._point_in_cam(unknowns)
+        arguments = (x, y, z, *(jnp.broadcast_to(k, x.shape) for k in self._intrinsics(unknowns)))
+        point, intrinsics = arguments[:3], arguments[3:]
+        refined = [i for i, is_refined in enumerate(self.refined) if is_refined]
+        wanted = [0, 1, 2, *(3 + i for i in refined)]
+
+        def derivatives(function: Callable[..., Array]) -> list[Array]:
+            found = jax.grad(lambda *a: jnp.sum(function(*a)), tuple(range(len(arguments))))(*arguments)
+            return [found[i] for i in wanted]
+
+        u, v = self._pixel(*arguments)
+        residual = self._weighted((u - self.xy_px[0], v - self.xy_px[1]))
+        _, slope, bent = loss.derivatives(residual[0] ** 2 + residual[1] ** 2)
+        by = [jnp.stack(self._weighted(derivatives(lambda *a, c=c: self._pixel(*a)[c]))) for c in range(2)]
+        pull = self._weighted([slope * r for r in residual])
+
+        def pulled(*arguments: Array) -> Array:
+            u, v = self._pixel(*arguments)
+            return jnp.sum(pull[0] * u + pull[1] * v)
+
+        # p's rows are by everything; of the rest only K by K is missing, of which little depends on p
+        by_p = _rows_of_jacobian(lambda *p: list(jax.grad(pulled, wanted)(*p, *intrinsics)), point)
+        second = by_p
+        if refined:
+
+            def by_refined(*changed: Array) -> list[Array]:
+                arguments = (*point, *_with(intrinsics, refined, changed))
+                return list(jax.grad(pulled, wanted[3:])(*arguments))
+
+            by_k = _rows_of_jacobian(by_refined, tuple(intrinsics[i] for i in refined))
+            across = jnp.swapaxes(by_p[:, 3:], 0, 1)
+            second = jnp.concatenate([by_p, jnp.concatenate([across, by_k], axis=1)])
+        through = by[0] * residual[0] + by[1] * residual[1]
+        hessian = slope * (by[0][:, None] * by[0] + by[1][:, None] * by[1]) + second
+        hessian += 2 * bent * through[:, None] * through
+        rows = jnp.concatenate([hessian, (slope * through)[:, None]], axis=1)
+        return rotation, (x, y, z), jnp.moveaxis(rows, 2, 0)
+
     def _point_in_cam(self, unknowns: Unknowns) -> tuple[Float[Array, "runs 3 3"], tuple[Array, Array, Array]]:
         pose = jnp.concatenate([unknowns.poses.rotation, unknowns.poses.translation[:, :, None]], axis=-1)
         pose = rows_of(pose, self.run_image)
@@ -106,3 +153,21 @@ class Reprojection(eqx.Module):
 
     def _weighted(self, pair: Components) -> Components:
         return [jnp.where(self.weight > 0, a * self.weight, 0.0) for a in pair]
+
+
+def _rows_of_jacobian(function: Callable[..., list[Array]], arguments: tuple[Array, ...]) -> Array:
+    """Derivatives of elementwise functions, (arguments, functions, *rest): one direction after another in a batch."""
+    size, shape = len(arguments), arguments[0].shape
+
+    def one(direction: Array) -> Array:
+        tangents = tuple(jnp.broadcast_to(direction[i], shape) for i in range(size))
+        return jnp.stack(jax.jvp(lambda *a: tuple(function(*a)), arguments, tangents)[1])
+
+    return jax.vmap(one)(jnp.eye(size, dtype=arguments[0].dtype))
+
+
+def _with(values: Sequence[Array], places: Sequence[int], changed: Sequence[Array]) -> list[Array]:
+    values = list(values)
+    for place, value in zip(places, changed, strict=True):
+        values[place] = value
+    return values

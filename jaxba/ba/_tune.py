@@ -1,0 +1,308 @@
+"""Tune: learn what an adjustment takes as given, the scale and shape of its loss and its sigmas, from data left out.
+
+    minimise over u:  score(x*(u)),      x*(u) = the optimum with `scale = scale_0 e^u`, `sigma = sigma_0 e^u`, ...
+
+by gradient descent through the solve (`_adjoint.py`). The score is of data that the fit never sees: coordinates of
+check points, as mean squared distance, or observations held out, as the mean of s / (s + 9) with s their squared
+distance in sigmas from the pixels that the fit predicts. The second is Geman and McClure's loss at three sigmas: wrong
+matches are among the held-out, too, and shall not be learned from.
+
+Each step starts from the optimum before it, a few steps of the solver away. Under a loss that levels off, a point with
+a wrong match may come to rest where its cost is flat and no minimum: then there is no exact derivative, and that step
+goes by the Gauss-Newton one, which is good enough to go down by.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+from threadpoolctl import threadpool_limits
+
+from jaxba._errors import JaxbaError
+from jaxba.ba._adjoint import Adjoint
+from jaxba.ba._check import prepare
+from jaxba.ba._gauge import require_gauge
+from jaxba.ba._plan import Plan, make_plan
+from jaxba.ba._problem import Observations, Problem
+from jaxba.ba._solution import Solution
+from jaxba.ba._solve import solve
+from jaxba.geometry import AbstractLoss
+
+_SHAPES = (-4.0, 2.0)  # of Barron's loss: the range that alpha is learned in
+_HELD_OUT_SIGMAS = 3.0
+_SPREAD = 1.0  # of the starts, in e-folds
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuned:
+    """What was learned.
+
+    - `loss`, `problem`: with the learned values; the problem holds what was fitted, and its optimum as start values.
+    - `learned`: values by name; of sigmas the factor.
+    - `score`: the lowest; `history`: that of every step and start, from the first on.
+    - `stopped`: why before the last step, or empty.
+    """
+
+    loss: AbstractLoss
+    problem: Problem
+    learned: dict[str, float]
+    score: float
+    history: Float[np.ndarray, "steps starts"]
+    stopped: str = ""
+
+
+def tune(
+    problem: Problem,
+    *,
+    loss: AbstractLoss,
+    learn: Sequence[str] = ("loss scale",),
+    check_points: tuple[Int[np.ndarray, " checks"], Float[np.ndarray, "checks 3"]] | None = None,
+    hold_out: float | None = None,
+    steps: int = 20,
+    learning_rate: float = 0.2,
+    optimizer: Any = None,
+    starts: int = 1,
+    seed: int = 0,
+    callback: Callable[[int, Float[np.ndarray, " starts"]], None] | None = None,
+) -> Tuned:
+    """Learn loss and sigmas by gradient descent through the adjustment, and return the best of all steps.
+
+    - `loss`: with its start values. `learn`: of `loss scale`, `loss shape` (of `Barron`), `pixel sigmas`, and
+      `position sigmas` and the like for each prior.
+    - `check_points`: indices and true coordinates of points whose coordinates the fit does not know, or
+    - `hold_out`: the share of the observations to leave out of the fit; a point keeps two.
+    - `optimizer`: of optax; `optax.adam(learning_rate)` if None.
+    - `starts`: how many descents, from start values spread by a factor of e, at once (`vmap`). `seed`: of the starts
+      and of what is held out.
+    - `callback`: called with the number of each step and the scores. Ctrl-C ends with the best so far.
+
+    Raises `JaxbaError` for names that cannot be learned, and for check points that are control points of the fit.
+
+    >>> import jaxba
+    >>> survey = jaxba.synthetic.uav_block(8, outlier_fraction=0.1)
+    >>> tuned = jaxba.tune(survey.problem, loss=jaxba.Cauchy(10.0), hold_out=0.1, steps=4)
+    >>> tuned.learned["loss scale"] < 10.0, bool(tuned.history[-1, 0] < tuned.history[0, 0])
+    (True, True)
+    """
+    import optax  # not needed by anything else
+
+    if (check_points is None) == (hold_out is None):
+        raise JaxbaError("tune: give check_points or hold_out, one of them: the data to be judged by.")
+    if steps < 1 or starts < 1:
+        raise JaxbaError(f"tune: steps={steps}, starts={starts}; both are 1 or more.")
+    _check_names(problem, loss, learn)
+    problem = prepare(problem).problem
+    require_gauge(problem, "Tuning")
+    rng = np.random.default_rng(seed)
+    if check_points is not None:
+        score = _check_point_score(problem, *check_points)
+    else:
+        problem, score = _held_out_score(problem, float(hold_out or 0.0), rng)
+    rule = optax.adam(learning_rate) if optimizer is None else optimizer
+
+    with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
+        plan = make_plan(problem)
+        first = solve(problem, loss=loss, plan=plan)
+        given = _given(loss, learn)
+        parameters = np.stack([np.full(starts, value) for value in given.values()], axis=1)
+        parameters[1:] += _SPREAD * rng.normal(size=parameters[1:].shape)
+        values = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (starts, *np.shape(leaf))), _values(first))
+        evaluate = _evaluation(problem, loss, tuple(learn), plan, score, starts)
+        approximate = _evaluation(problem, loss, tuple(learn), plan, score, starts, "gauss_newton")
+        state = rule.init(jnp.asarray(parameters))
+        history, best, stopped = [], (np.inf, parameters[0], _start(values, 0)), ""
+        try:
+            for step in range(steps + 1):
+                try:
+                    (scores, values), gradient = evaluate(parameters, values)
+                except (JaxbaError, eqx.EquinoxRuntimeError):  # some point lies where its loss has levelled off
+                    (scores, values), gradient = approximate(parameters, values)
+                scores = np.asarray(scores)
+                history.append(scores)
+                leader = int(np.nanargmin(scores)) if np.isfinite(scores).any() else 0
+                if scores[leader] < best[0]:
+                    best = float(scores[leader]), parameters[leader], _start(values, leader)
+                if callback is not None:
+                    callback(step, scores)
+                change, state = rule.update(jnp.nan_to_num(gradient), state, jnp.asarray(parameters))
+                parameters = np.asarray(optax.apply_updates(jnp.asarray(parameters), change))
+        except KeyboardInterrupt:
+            stopped = "interrupted"
+        except JaxbaError as error:
+            if not history:
+                raise
+            stopped = str(error)
+        if not history or not np.isfinite(best[0]):
+            raise JaxbaError(f"tune: no score was reached{': ' + stopped if stopped else ''}.")
+    tuned_problem, tuned_loss = _apply(problem, loss, tuple(learn), best[1], np)
+    poses, cameras, points, lever_arm = jax.device_get(best[2])
+    tuned_problem = eqx.tree_at(
+        lambda p: (p.poses, p.cameras, p.points, p.lever_arm), tuned_problem, (poses, cameras, points, lever_arm)
+    )
+    tuned_loss = jax.tree.map(float, tuned_loss)
+    learned = dict(zip(learn, (float(v) for v in _physical(given, best[1], loss, np)), strict=True))
+    return Tuned(tuned_loss, tuned_problem, learned, best[0], np.array(history), stopped)
+
+
+def _check_names(problem: Problem, loss: AbstractLoss, learn: Sequence[str]) -> None:
+    known = [
+        *(["loss scale"] if type(loss).__name__ != "Linear" else []),
+        *(["loss shape"] if hasattr(loss, "alpha") else []),
+    ]
+    known += ["pixel sigmas", *(f"{prior.name} sigmas" for prior in problem.priors)]
+    for name in learn:
+        if name not in known:
+            raise JaxbaError(f"tune: learn={name!r}: this problem and loss have {', '.join(known)}.")
+    if not learn or len(set(learn)) != len(learn):
+        raise JaxbaError(f"tune: learn={tuple(learn)}: name one or more of {', '.join(known)}, each once.")
+
+
+def _given(loss: AbstractLoss, learn: Sequence[str]) -> dict[str, float]:
+    """Return the start value of each parameter: logarithms of factors; of the shape, the logit of its place."""
+    low, high = _SHAPES
+    given = {}
+    for name in learn:
+        given[name] = 0.0
+        if name == "loss shape":
+            share = (float(loss.alpha) - low) / (high - low)  # pyright: ignore[reportAttributeAccessIssue]
+            share = min(max(share, 1e-3), 1 - 1e-3)
+            given[name] = float(np.log(share / (1 - share)))
+    return given
+
+
+def _physical(given: dict[str, float], parameters: Any, loss: AbstractLoss, xp: Any) -> list[Any]:
+    """Return scale, shape and factors from the parameters."""
+    low, high = _SHAPES
+    found = []
+    for i, name in enumerate(given):
+        value = parameters[i]
+        if name == "loss shape":
+            found.append(low + (high - low) / (1 + xp.exp(-value)))
+        else:
+            found.append((loss.f_scale if name == "loss scale" else 1.0) * xp.exp(value))
+    return found
+
+
+def _apply(
+    problem: Problem, loss: AbstractLoss, learn: tuple[str, ...], parameters: Any, xp: Any
+) -> tuple[Problem, AbstractLoss]:
+    """Return problem and loss with the parameters' values."""
+    given = dict.fromkeys(learn, 0.0)
+    for name, value in zip(learn, _physical(given, parameters, loss, xp), strict=True):
+        if name == "loss scale":
+            loss = eqx.tree_at(lambda of: of.f_scale, loss, value)
+        elif name == "loss shape":
+            loss = eqx.tree_at(lambda of: of.alpha, loss, value)
+        elif name == "pixel sigmas":
+            problem = eqx.tree_at(lambda p: p.observations.std_px, problem, problem.observations.std_px * value)
+        else:
+            i = next(i for i, prior in enumerate(problem.priors) if f"{prior.name} sigmas" == name)
+            prior = problem.priors[i]
+            sigmas = {
+                f.name: getattr(prior, f.name) * value for f in dataclasses.fields(prior) if f.name.startswith("std")
+            }
+            scaled = dataclasses.replace(prior, **sigmas)
+            problem = dataclasses.replace(problem, priors=(*problem.priors[:i], scaled, *problem.priors[i + 1 :]))
+    return problem, loss
+
+
+def _evaluation(
+    problem: Problem,
+    loss: AbstractLoss,
+    learn: tuple[str, ...],
+    plan: Plan,
+    score: Callable[[Solution], Float[Array, ""]],
+    starts: int,
+    adjoint: Adjoint = "implicit",
+) -> Callable[[Any, Any], Any]:
+    """Return the function from parameters and start values, a row a start, to ((scores, optima), gradients)."""
+
+    def one(parameters: Any, values: Any) -> tuple[Array, Any]:
+        of_problem, of_loss = _apply(problem, loss, learn, parameters, jnp)
+        values = jax.lax.stop_gradient(values)
+        of_problem = eqx.tree_at(lambda p: (p.poses, p.cameras, p.points, p.lever_arm), of_problem, values)
+        found = solve(of_problem, loss=of_loss, plan=plan, adjoint=adjoint)
+        return score(found), jax.lax.stop_gradient(_values(found))
+
+    of_one = jax.value_and_grad(one, has_aux=True)
+    if starts > 1:
+        return eqx.filter_jit(jax.vmap(of_one))  # its errors can be caught
+
+    def alone(parameters: Any, values: Any) -> Any:  # outside of jit, the steps are those of an ordinary solve
+        found = of_one(parameters[0], _start(values, 0))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], found)
+
+    return alone
+
+
+def _values(solution: Solution) -> tuple[Any, ...]:
+    return solution.poses, solution.cameras, solution.points, solution.lever_arm
+
+
+def _start(values: Any, start: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[start], values)
+
+
+def _check_point_score(
+    problem: Problem, index: Int[np.ndarray, " checks"], xyz: Float[np.ndarray, "checks 3"]
+) -> Callable[[Solution], Float[Array, ""]]:
+    index, xyz = np.asarray(index), np.asarray(xyz, float)
+    if len(index) == 0 or index.min() < 0 or index.max() >= problem.num_points or xyz.shape != (len(index), 3):
+        raise JaxbaError(
+            f"tune: check_points of {index.shape} indices and {xyz.shape} coordinates; give one index below "
+            f"{problem.num_points} and x, y, z for each."
+        )
+    control = problem.prior("control")
+    if control is not None:
+        both = np.intersect1d(index, np.asarray(control.point_index))  # pyright: ignore[reportAttributeAccessIssue]
+        if len(both):
+            raise JaxbaError(
+                f"tune: point {both[0]} is a check point and a control point of the fit; what judges must not be "
+                "fitted."
+            )
+
+    def score(solution: Solution) -> Float[Array, ""]:
+        return jnp.mean(jnp.sum((jnp.asarray(solution.points)[index] - xyz) ** 2, axis=1))
+
+    return score
+
+
+def _held_out_score(
+    problem: Problem, share: float, rng: np.random.Generator
+) -> tuple[Problem, Callable[[Solution], Float[Array, ""]]]:
+    """Return the problem without the observations held out, and their score."""
+    if not 0 < share < 1:
+        raise JaxbaError(f"tune: hold_out={share:g}: give a share of the observations, such as 0.1.")
+    seen = problem.observations
+    image, point = np.asarray(seen.image_index), np.asarray(seen.point_index)
+    order = rng.permutation(len(point))
+    # the n-th observation of its point, in random order: all but two of each may be left out
+    by_point = order[np.argsort(point[order], kind="stable")]
+    starts = np.flatnonzero(np.diff(point[by_point], prepend=-1))
+    rank = np.arange(len(by_point)) - np.repeat(starts, np.diff(starts, append=len(by_point)))
+    may = by_point[rank >= 2]
+    out = np.sort(rng.permutation(may)[: round(share * len(point))])
+    if not len(out):
+        raise JaxbaError("tune: no point is seen three times, so no observation can be held out; use check_points.")
+    kept = np.setdiff1d(np.arange(len(point)), out)
+
+    def part(index: Int[np.ndarray, " n"]) -> Observations:
+        return Observations(np.asarray(seen.xy_px)[index], np.asarray(seen.std_px)[index], image[index], point[index])
+
+    left_out = part(out)
+    camera = np.asarray(problem.camera_index)[left_out.image_index]
+
+    def score(solution: Solution) -> Float[Array, ""]:
+        poses = jax.tree.map(lambda leaf: jnp.asarray(leaf)[left_out.image_index], solution.poses)
+        cameras = jax.tree.map(lambda leaf: jnp.asarray(leaf)[camera], solution.cameras)
+        pixel = cameras.project(poses.transform(jnp.asarray(solution.points)[left_out.point_index]))
+        squared = jnp.sum((pixel - left_out.xy_px) ** 2, axis=1) / left_out.std_px**2
+        return jnp.mean(squared / (squared + _HELD_OUT_SIGMAS**2))
+
+    return dataclasses.replace(problem, observations=part(kept)), score

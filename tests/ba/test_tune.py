@@ -1,0 +1,69 @@
+"""Tuning against the truth of simulated surveys, and what it refuses."""
+
+import numpy as np
+import pytest
+
+import jaxba
+from jaxba import JaxbaError
+
+
+@pytest.fixture(scope="module")
+def survey() -> jaxba.synthetic.Survey:
+    return jaxba.synthetic.uav_block(
+        8, seed=3, outlier_fraction=0.2, num_check=20, camera=jaxba.SimplePinhole(4000.0, 2736.0, 1824.0)
+    )
+
+
+def _rms(survey: jaxba.synthetic.Survey, points: np.ndarray) -> float:
+    check = survey.truth.check_index
+    return float(np.sqrt(np.mean(np.sum((np.asarray(points)[check] - survey.truth.points[check]) ** 2, axis=1))))
+
+
+def test_a_scale_learned_from_held_out_observations_is_nearer_the_truth(survey: jaxba.synthetic.Survey):
+    far = jaxba.Huber(30.0)
+    tuned = jaxba.tune(survey.problem, loss=far, hold_out=0.1, steps=8, learning_rate=0.5)
+    assert tuned.history[-1, 0] < tuned.history[0, 0] and tuned.score == tuned.history.min()
+    assert tuned.learned["loss scale"] == pytest.approx(float(tuned.loss.f_scale)) and tuned.loss.f_scale < 10.0
+    before = _rms(survey, jaxba.solve(survey.problem, loss=far).points)
+    assert _rms(survey, jaxba.solve(survey.problem, loss=tuned.loss).points) < 0.8 * before
+    assert tuned.problem.num_observations < survey.problem.num_observations  # the held-out data was not in the fit
+
+
+def test_several_starts_at_once_end_at_the_best(survey: jaxba.synthetic.Survey):
+    check = survey.truth.check_index
+    tuned = jaxba.tune(
+        survey.problem,
+        loss=jaxba.Huber(5.0),
+        learn=("loss scale", "position sigmas"),
+        check_points=(check, survey.truth.points[check]),
+        starts=2,
+        steps=2,
+    )
+    assert tuned.history.shape == (3, 2) and tuned.score == tuned.history.min()
+    assert set(tuned.learned) == {"loss scale", "position sigmas"}
+    given, learned = survey.problem.priors[0], tuned.problem.priors[0]
+    np.testing.assert_allclose(learned.std_m, given.std_m * tuned.learned["position sigmas"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "give check_points or hold_out, one of them"),
+        (
+            {"hold_out": 0.1, "learn": ("loss shape",)},
+            r"learn='loss shape': this problem and loss have loss scale, pixel",
+        ),
+        ({"hold_out": 1.5}, "hold_out=1.5: give a share"),
+        ({"hold_out": 0.1, "steps": 0}, "steps=0"),
+        ({"check_points": (np.array([10**6]), np.zeros((1, 3)))}, "give one index below"),
+    ],
+)
+def test_what_cannot_be_tuned_is_refused(survey: jaxba.synthetic.Survey, options: dict, message: str):
+    with pytest.raises(JaxbaError, match=message):
+        jaxba.tune(survey.problem, loss=jaxba.Huber(1.0), **options)
+
+
+def test_a_check_point_must_not_be_control_of_the_fit():
+    survey = jaxba.synthetic.uav_block(4, num_control=3)
+    with pytest.raises(JaxbaError, match="point 1 is a check point and a control point"):
+        jaxba.tune(survey.problem, loss=jaxba.Huber(1.0), check_points=(np.array([1]), survey.truth.points[[1]]))

@@ -113,14 +113,14 @@ def test_ctrl_c_ends_with_130_and_the_next_run_goes_on(cli: Cli, photos: Path, t
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     until = time.monotonic() + 120
     features = tmp_path / "project" / "stages" / "features"
-    while time.monotonic() < until and len(list(features.glob("*/record.json"))) < 2:
+    while time.monotonic() < until and not list(features.glob("*/record.json")):
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it, to the workers too
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert err == "jaxba: interrupted; what is done is kept, and the same command goes on from there.\n"
     kept = {path: path.stat().st_ino for path in features.glob("*/record.json")}
-    assert 2 <= len(kept) < NUM_PHOTOS and not list(features.glob(".*"))
+    assert 1 <= len(kept) < NUM_PHOTOS and not list(features.glob(".*"))
     code, out, _ = cli(*arguments)
     assert code == 0 and out.startswith("features  ")
     assert all(path.stat().st_ino == inode for path, inode in kept.items())

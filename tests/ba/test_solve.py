@@ -73,16 +73,6 @@ def test_traced_values_without_a_plan_are_refused_with_the_cure() -> None:
         jax.jit(lambda p: jaxba.solve(p).final_cost)(_on_device(SMALL.problem))
 
 
-def test_derivative_is_refused_with_the_reason() -> None:
-    plan = jaxba.make_plan(SMALL.problem)
-
-    def final_cost(scale: jax.Array) -> jax.Array:
-        return jaxba.solve(SMALL.problem, loss=jaxba.Huber(scale), plan=plan).final_cost
-
-    with pytest.raises(RuntimeError, match="cannot be differentiated yet"):
-        jax.grad(final_cost)(jax.numpy.asarray(1.0))
-
-
 def test_interrupt_keeps_what_was_reached() -> None:
     def stop(step: HistoryStep) -> None:
         if step.step == 2:

@@ -39,7 +39,7 @@ from jaxba.geometry import Linear
 Adjoint = Literal["implicit", "gauss_newton", "unrolled"]
 
 _ON_BOUND = 1e-12
-_SETTLED, _MOST_ROUNDS = 1e-12, 10
+_SETTLED, _MOST_ROUNDS = 1e-10, 3
 _SINGULAR = 1e-13  # pivot over what it was before anything was eliminated
 _NOT_A_MINIMUM = (
     "Derivatives: the values reached are no isolated minimum, so they have none. Either nothing fixes the block or a "

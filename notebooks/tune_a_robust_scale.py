@@ -81,9 +81,9 @@ plt.show()
 # %%
 assert rms[-1] < rms[0] / 2
 lowest = int(np.argmin(errors))
-step = 1e-3
+step = 1e-4
 tight = {"ftol": 0.0, "xtol": 1e-12}
 difference = (check_point_error(step, **tight) - check_point_error(-step, **tight)) / (2 * step)
 print(f"slope at scale 1: {slope:.4e} by the adjoint, {difference:.4e} by two more solves")
-assert abs(slope / difference - 1) < 0.02
+assert abs(slope / difference - 1) < 0.005  # a longer step would cross corners of the loss
 print("lowest of the curve at scale", float(np.exp(log_scales[lowest]).round(2)))

@@ -11,10 +11,11 @@ and a second derivative differentiates it, for which `custom_linear_solve` gets 
 
 A solver stops where the cost no longer changes, some thousandths of a sigma before the optimum; there the rule would be
 off by as much. One Newton step with H, whose error is squared, goes before it. A point with a wrong match may have come
-to rest on a saddle, where nothing tells which way it would go: it is held.
+to rest on a saddle, where nothing tells which way it would go: it is held, and a warning says so.
 """
 
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -47,9 +48,9 @@ _NOT_A_MINIMUM = (
     "two poses; leave out points seen once, as solution.report.problem does), or the solver stopped before it "
     "converged (solution.advice)."
 )
-_NOT_DOUBLE = (
-    "Derivatives of solve are computed in double precision: call jax.config.update('jax_enable_x64', True) before "
-    "anything else of jax."
+_HELD = (
+    "Derivatives: {held} of {points} points rest on a saddle instead of in a minimum, as a wrong match makes them, and "
+    "count as fixed. Leave wrong matches out first (jaxba.solve_and_reject)."
 )
 
 
@@ -63,14 +64,19 @@ class Found(NamedTuple):
 
 @eqx.filter_custom_jvp
 def optimum(
-    system: System, start: Unknowns, *, forward: Callable[[System, Unknowns], Found], exact: bool, is_double: bool
+    system: System,
+    start: Unknowns,
+    *,
+    forward: Callable[[System, Unknowns], Found],
+    exact: bool,
+    require: Callable[[], None],
 ) -> Found:
     """Return `forward(system, start)`, with the derivatives of an optimum.
 
     - `exact`: whether H holds the second derivatives, or J^T J alone.
-    - `is_double`: whether jax is set to double precision, without which derivatives are refused.
+    - `require`: called where derivatives are taken; raises `JaxbaError` where the problem can have none.
     """
-    del exact, is_double
+    del exact, require
     return forward(system, start)
 
 
@@ -81,20 +87,34 @@ def _optimum_jvp(
     *,
     forward: Callable[[System, Unknowns], Found],
     exact: bool,
-    is_double: bool,
+    require: Callable[[], None],
 ) -> tuple[Found, Found]:
-    if not is_double:
-        raise JaxbaError(_NOT_DOUBLE)
+    require()
     system, start = primals
-    found = optimum(system, start, forward=forward, exact=exact, is_double=is_double)
+    found = optimum(system, start, forward=forward, exact=exact, require=require)
     system_dot, start_dot = (_zeros_for_none(p, t) for p, t in zip(primals, tangents, strict=True))
     try:
         near, equations = _at_the_optimum(*jax.lax.stop_gradient((system, found.unknowns)), exact)
         unknowns = jax.tree.map(lambda a, b: a + jax.lax.stop_gradient(b - a), found.unknowns, near)
+        _tell_held(jnp.sum(system.free.points[:, 0]), jnp.sum(equations.system.free.points[:, 0]))
         moved = _moved(system, unknowns, equations, system_dot, start_dot)
     except eqx.EquinoxRuntimeError as error:
         raise JaxbaError(_NOT_A_MINIMUM) from error
     return found, Found(moved, None, None)  # pyright: ignore[reportArgumentType]
+
+
+def _tell_held(free: Array, left: Array) -> None:
+    """Warn of points that were held, also from inside a jit."""
+
+    def tell(free: Any, left: Any) -> None:
+        if left < free:
+            text = _HELD.format(held=int(free - left), points=int(free))
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
+
+    if is_traced((free, left)):
+        jax.debug.callback(tell, free, left)
+    else:
+        tell(free, left)
 
 
 def gradient(system: System, unknowns: Unknowns) -> Step:
@@ -209,8 +229,7 @@ def _hold_saddles(system: System, model: Linearisation) -> tuple[System, Lineari
         model.point_shared * stands[:, None, None],
         model.gradient.points * stands[:, None],
     )
-    places = lambda m: (m.w, m.point_products, m.point_shared, m.gradient.points)  # noqa: E731
-    return system, eqx.tree_at(places, model, held)
+    return system, eqx.tree_at(lambda m: (m.w, m.point_products, m.point_shared, m.gradient.points), model, held)
 
 
 @eqx.filter_jit

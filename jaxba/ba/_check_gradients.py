@@ -122,8 +122,8 @@ def check_gradients(
     problem = prepare(problem).problem
     require_gauge(problem, "Derivatives")
     with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
-        solution = solve(problem, loss=loss, **_TIGHT)
-        if not solution.converged and solution.result != "stuck":
+        solution = solve(problem, loss=loss)
+        if not solution.converged:
             raise JaxbaError(f"Gradient check: the solve has no optimum to look at. {solution.advice}")
         problem = solution.apply(problem)
         plan = make_plan(problem)

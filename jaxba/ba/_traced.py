@@ -32,6 +32,11 @@ from jaxba.ba._solvers import AbstractSchurSolver, SchurLevenbergMarquardt, resi
 from jaxba.ba._system import System, initial_unknowns, is_traced, make_system, restore, without_losses
 from jaxba.geometry import AbstractLoss
 
+_NOT_DOUBLE = (
+    "Derivatives of solve are computed in double precision: call jax.config.update('jax_enable_x64', True) before "
+    "anything else of jax."
+)
+
 
 def solve_traced(
     problem: Problem,
@@ -57,12 +62,19 @@ def solve_traced(
             raise KeyboardInterrupt
         return Found(reached.unknowns, reached.state.status, reached.state.num_steps)
 
+    def require() -> None:
+        if dtype != jnp.float64:
+            raise JaxbaError(_NOT_DOUBLE)
+        if not is_traced(problem):
+            with jax.ensure_compile_time_eval():
+                require_gauge(problem, "Derivatives")
+
     with threadpool_limits(1, user_api="blas"):
         system, start = _lay_out(problem, plan, loss, dtype)
         if adjoint == "unrolled":
             found = _descend_traced(system, start, solver, max_nfev, optx.RecursiveCheckpointAdjoint())
         else:
-            found = optimum(system, start, forward=forward, exact=adjoint == "implicit", is_double=dtype == jnp.float64)
+            found = optimum(system, start, forward=forward, exact=adjoint == "implicit", require=require)
         values, costs = _result(system, start, found.unknowns, problem, plan)
     return _solution(problem, found, values, costs)
 
@@ -101,7 +113,6 @@ def _structure(problem: Problem, plan: Plan | None, linear_solver: LinearSolver)
     """Return the problem that can be solved, as far as its values are known, and its plan."""
     if not is_traced(problem):
         prepared = prepare(problem)
-        require_gauge(prepared.problem, "Derivatives")
         if plan is None or prepared.dropped.any():
             like = None if plan is None else plan.shape
             plan = make_plan(prepared.problem, linear_solver=linear_solver, like=like)

@@ -29,10 +29,10 @@ from jaxba.ba._adjoint import Adjoint
 from jaxba.ba._check import prepare
 from jaxba.ba._gauge import require_gauge
 from jaxba.ba._plan import Plan, make_plan
-from jaxba.ba._problem import Observations, Problem
+from jaxba.ba._problem import AbstractPrior, Observations, Problem
 from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
-from jaxba.geometry import AbstractLoss
+from jaxba.geometry import AbstractLoss, Barron, Linear
 
 _SHAPES = (-4.0, 2.0)  # of Barron's loss: the range that alpha is learned in
 _HELD_OUT_SIGMAS = 3.0
@@ -46,7 +46,7 @@ class Tuned:
     - `loss`, `problem`: with the learned values; the problem holds what was fitted, and its optimum as start values.
     - `learned`: values by name; of sigmas the factor.
     - `score`: the lowest; `history`: that of every step and start, from the first on.
-    - `stopped`: why before the last step, or empty.
+    - `approximate_steps`: how many went by the Gauss-Newton derivative. `stopped`: why before the last step, or empty.
     """
 
     loss: AbstractLoss
@@ -54,6 +54,7 @@ class Tuned:
     learned: dict[str, float]
     score: float
     history: Float[np.ndarray, "steps starts"]
+    approximate_steps: int = 0
     stopped: str = ""
 
 
@@ -109,20 +110,20 @@ def tune(
     with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
         plan = make_plan(problem)
         first = solve(problem, loss=loss, plan=plan)
-        given = _given(loss, learn)
-        parameters = np.stack([np.full(starts, value) for value in given.values()], axis=1)
+        parameters = np.tile(_given(loss, learn), (starts, 1))
         parameters[1:] += _SPREAD * rng.normal(size=parameters[1:].shape)
         values = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (starts, *np.shape(leaf))), _values(first))
-        evaluate = _evaluation(problem, loss, tuple(learn), plan, score, starts)
-        approximate = _evaluation(problem, loss, tuple(learn), plan, score, starts, "gauss_newton")
+        evaluate = _evaluation(problem, loss, learn, plan, score, starts)
+        approximate = _evaluation(problem, loss, learn, plan, score, starts, "gauss_newton")
         state = rule.init(jnp.asarray(parameters))
-        history, best, stopped = [], (np.inf, parameters[0], _start(values, 0)), ""
+        history, best, stopped, approximate_steps = [], (np.inf, parameters[0], _start(values, 0)), "", 0
         try:
             for step in range(steps + 1):
                 try:
                     (scores, values), gradient = evaluate(parameters, values)
                 except (JaxbaError, eqx.EquinoxRuntimeError):  # some point lies where its loss has levelled off
                     (scores, values), gradient = approximate(parameters, values)
+                    approximate_steps += 1
                 scores = np.asarray(scores)
                 history.append(scores)
                 leader = int(np.nanargmin(scores)) if np.isfinite(scores).any() else 0
@@ -134,27 +135,25 @@ def tune(
                 parameters = np.asarray(optax.apply_updates(jnp.asarray(parameters), change))
         except KeyboardInterrupt:
             stopped = "interrupted"
-        except JaxbaError as error:
+        except (JaxbaError, eqx.EquinoxRuntimeError) as error:
             if not history:
                 raise
             stopped = str(error)
         if not history or not np.isfinite(best[0]):
             raise JaxbaError(f"tune: no score was reached{': ' + stopped if stopped else ''}.")
-    tuned_problem, tuned_loss = _apply(problem, loss, tuple(learn), best[1], np)
+    tuned_problem, tuned_loss = _apply(problem, loss, learn, best[1], np)
     poses, cameras, points, lever_arm = jax.device_get(best[2])
     tuned_problem = eqx.tree_at(
         lambda p: (p.poses, p.cameras, p.points, p.lever_arm), tuned_problem, (poses, cameras, points, lever_arm)
     )
     tuned_loss = jax.tree.map(float, tuned_loss)
-    learned = dict(zip(learn, (float(v) for v in _physical(given, best[1], loss, np)), strict=True))
-    return Tuned(tuned_loss, tuned_problem, learned, best[0], np.array(history), stopped)
+    learned = {name: float(value) for name, value in _physical(learn, best[1], loss, np).items()}
+    return Tuned(tuned_loss, tuned_problem, learned, best[0], np.array(history), approximate_steps, stopped)
 
 
 def _check_names(problem: Problem, loss: AbstractLoss, learn: Sequence[str]) -> None:
-    known = [
-        *(["loss scale"] if type(loss).__name__ != "Linear" else []),
-        *(["loss shape"] if hasattr(loss, "alpha") else []),
-    ]
+    known = [] if isinstance(loss, Linear) else ["loss scale"]
+    known += ["loss shape"] if isinstance(loss, Barron) else []
     known += ["pixel sigmas", *(f"{prior.name} sigmas" for prior in problem.priors)]
     for name in learn:
         if name not in known:
@@ -163,59 +162,51 @@ def _check_names(problem: Problem, loss: AbstractLoss, learn: Sequence[str]) -> 
         raise JaxbaError(f"tune: learn={tuple(learn)}: name one or more of {', '.join(known)}, each once.")
 
 
-def _given(loss: AbstractLoss, learn: Sequence[str]) -> dict[str, float]:
+def _given(loss: AbstractLoss, learn: Sequence[str]) -> list[float]:
     """Return the start value of each parameter: logarithms of factors; of the shape, the logit of its place."""
-    low, high = _SHAPES
-    given = {}
-    for name in learn:
-        given[name] = 0.0
-        if name == "loss shape":
-            share = (float(loss.alpha) - low) / (high - low)  # pyright: ignore[reportAttributeAccessIssue]
-            share = min(max(share, 1e-3), 1 - 1e-3)
-            given[name] = float(np.log(share / (1 - share)))
+    given = [0.0] * len(learn)
+    if isinstance(loss, Barron) and "loss shape" in learn:
+        low, high = _SHAPES
+        share = min(max((float(loss.alpha) - low) / (high - low), 1e-3), 1 - 1e-3)
+        given[list(learn).index("loss shape")] = float(np.log(share / (1 - share)))
     return given
 
 
-def _physical(given: dict[str, float], parameters: Any, loss: AbstractLoss, xp: Any) -> list[Any]:
+def _physical(learn: Sequence[str], parameters: Any, loss: AbstractLoss, xp: Any) -> dict[str, Any]:
     """Return scale, shape and factors from the parameters."""
     low, high = _SHAPES
-    found = []
-    for i, name in enumerate(given):
-        value = parameters[i]
+    found = {}
+    for name, value in zip(learn, parameters, strict=True):
         if name == "loss shape":
-            found.append(low + (high - low) / (1 + xp.exp(-value)))
+            found[name] = low + (high - low) / (1 + xp.exp(-value))
         else:
-            found.append((loss.f_scale if name == "loss scale" else 1.0) * xp.exp(value))
+            found[name] = (loss.f_scale if name == "loss scale" else 1.0) * xp.exp(value)
     return found
 
 
 def _apply(
-    problem: Problem, loss: AbstractLoss, learn: tuple[str, ...], parameters: Any, xp: Any
+    problem: Problem, loss: AbstractLoss, learn: Sequence[str], parameters: Any, xp: Any
 ) -> tuple[Problem, AbstractLoss]:
     """Return problem and loss with the parameters' values."""
-    given = dict.fromkeys(learn, 0.0)
-    for name, value in zip(learn, _physical(given, parameters, loss, xp), strict=True):
-        if name == "loss scale":
-            loss = eqx.tree_at(lambda of: of.f_scale, loss, value)
-        elif name == "loss shape":
-            loss = eqx.tree_at(lambda of: of.alpha, loss, value)
-        elif name == "pixel sigmas":
-            problem = eqx.tree_at(lambda p: p.observations.std_px, problem, problem.observations.std_px * value)
-        else:
-            i = next(i for i, prior in enumerate(problem.priors) if f"{prior.name} sigmas" == name)
-            prior = problem.priors[i]
-            sigmas = {
-                f.name: getattr(prior, f.name) * value for f in dataclasses.fields(prior) if f.name.startswith("std")
-            }
-            scaled = dataclasses.replace(prior, **sigmas)
-            problem = dataclasses.replace(problem, priors=(*problem.priors[:i], scaled, *problem.priors[i + 1 :]))
-    return problem, loss
+    found = _physical(learn, parameters, loss, xp)
+    changed = {"f_scale": found.get("loss scale"), "alpha": found.get("loss shape")}
+    loss = dataclasses.replace(loss, **{name: value for name, value in changed.items() if value is not None})
+    if "pixel sigmas" in found:
+        std_px = problem.observations.std_px * found["pixel sigmas"]
+        problem = eqx.tree_at(lambda p: p.observations.std_px, problem, std_px)
+    priors = [_scaled(prior, found.get(f"{prior.name} sigmas", 1.0)) for prior in problem.priors]
+    return dataclasses.replace(problem, priors=tuple(priors)), loss
+
+
+def _scaled(prior: AbstractPrior, factor: Any) -> AbstractPrior:
+    names = [field.name for field in dataclasses.fields(prior) if field.name.startswith("std")]
+    return dataclasses.replace(prior, **{name: getattr(prior, name) * factor for name in names})
 
 
 def _evaluation(
     problem: Problem,
     loss: AbstractLoss,
-    learn: tuple[str, ...],
+    learn: Sequence[str],
     plan: Plan,
     score: Callable[[Solution], Float[Array, ""]],
     starts: int,

@@ -12,11 +12,14 @@ from small_problems import EVERY_CAMERA, RADIAL, small_problem
 
 import jaxba
 from jaxba import JaxbaError, Problem
-from jaxba.ba._adjoint import _equations
+from jaxba.ba._adjoint import _equations, _hold_saddles, _tell_held
+from jaxba.ba._factor import factor_reduced, solve_factored
 from jaxba.ba._hessian import hessian
 from jaxba.ba._linearise import cost, curvature
 from jaxba.ba._plan import make_plan
-from jaxba.ba._system import initial_unknowns, make_system
+from jaxba.ba._rows import Step, Unknowns
+from jaxba.ba._schur import back_substitute, eliminate_points, reduce_vector
+from jaxba.ba._system import System, initial_unknowns, make_system
 from jaxba.geometry import AbstractLoss, Cauchy, Huber
 
 SIMPLE = EVERY_CAMERA[0]
@@ -140,6 +143,37 @@ def test_cost_and_residuals_have_derivatives(block: Problem):
     high, low = (jax.jvp(at, (std + s * direction,), (direction,))[0] for s in (step, -step))
     for a, b, c in zip(found, high, low, strict=True):
         np.testing.assert_allclose(a, (np.asarray(b) - np.asarray(c)) / (2 * step), rtol=1e-3, atol=1e-6)
+
+
+def test_a_point_on_a_saddle_is_held_and_told():
+    problem = _optimum(small_problem(SIMPLE), Cauchy(3.0))
+    plan = make_plan(problem.fix(points=[7]))  # one plan for both
+    point = int(np.argsort(plan.point_order)[7])
+    unknowns = initial_unknowns(problem, plan)
+    free, fixed = (make_system(p, plan, Cauchy(3.0)) for p in (problem, problem.fix(points=[7])))
+    rhs = jax.tree.map(np.ones_like, fixed.free)
+    rhs = jax.tree.map(jnp.multiply, rhs, fixed.free)
+
+    @jax.jit
+    def solutions(free: System, fixed: System, unknowns: Unknowns) -> tuple[Step, Step, Step]:
+        model = hessian(free, unknowns)
+        bent = eqx.tree_at(lambda m: m.point_products, model, model.point_products.at[point, 2, 2].multiply(-1.0))
+        system, held = _hold_saddles(free, bent)
+        reduced = eliminate_points(system, held, jax.tree.map(jnp.zeros_like, rhs))
+        vector = solve_factored(system, reduced, factor_reduced(system, reduced), reduce_vector(system, reduced, rhs))
+        return back_substitute(system, reduced, rhs, vector), _equations(fixed, unknowns, True).solve(rhs), system.free
+
+    found, expected, left = solutions(free, fixed, unknowns)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
+    with pytest.warns(RuntimeWarning, match=r"1 of 20 points rest on a saddle .*solve_and_reject"):
+        _tell_held(jnp.sum(free.free.points[:, 0]), jnp.sum(left.points[:, 0]))
+
+
+def test_a_free_gauge_is_solved_where_no_derivative_is_asked_for(block: Problem):
+    free = eqx.tree_at(lambda p: p.priors, block, ())
+    cost_of = jax.jit(lambda s: jaxba.solve(free, loss=Cauchy(s)).final_cost)
+    assert float(cost_of(2.0)) == pytest.approx(float(jaxba.solve(free, loss=Cauchy(2.0)).final_cost), rel=1e-6)
 
 
 def test_a_free_gauge_is_refused_with_the_cure(block: Problem):

@@ -67,23 +67,8 @@ class PriorBlocks(eqx.Module):
 
 def add_products(blocks: PriorBlocks, rows: Rows) -> PriorBlocks:
     """Add a prior's J^T J."""
-
-    def square(total: Array, block: Block | None) -> Array:
-        return total if block is None else total + block_products(block, total.shape[0])
-
-    lever_arm, cross = blocks.lever_arm, blocks.poses_lever_arm
-    if rows.lever_arm is not None:
-        lever_arm += jnp.einsum("cin,cjn->ij", rows.lever_arm, rows.lever_arm)
-        if rows.pose is not None:
-            products = jnp.einsum("cin,cjn->nij", rows.pose.jacobian, rows.lever_arm)
-            cross += segments(products, rows.pose.index, cross.shape[0])
-    return PriorBlocks(
-        square(blocks.poses, rows.pose),
-        square(blocks.intrinsics, rows.intrinsics),
-        lever_arm,
-        cross,
-        square(blocks.points, rows.point),
-    )
+    jacobian = jnp.concatenate(list(_by_kind(rows).values()), axis=1)
+    return _add(blocks, rows, jnp.einsum("cin,cjn->nij", jacobian, jacobian))
 
 
 def add_second_derivatives(
@@ -93,12 +78,8 @@ def add_second_derivatives(
 
     A row touches at most one of each kind, so a step that all of a kind take together tells every row's derivatives.
     """
-    touched = prior.rows(unknowns)
-    kinds = [kind for kind in ("pose", "intrinsics", "lever_arm", "point") if getattr(touched, kind) is not None]
-    sizes = [6 if kind == "pose" else unknowns.intrinsics.shape[1] if kind == "intrinsics" else 3 for kind in kinds]
-    places = {kind: slice(sum(sizes[:i]), sum(sizes[: i + 1])) for i, kind in enumerate(kinds)}
-    index = {kind: getattr(touched, kind).index for kind in kinds if kind != "lever_arm"}
-    zero = jax.tree.map(jnp.zeros_like, system.free)
+    rows, free = prior.rows(unknowns), system.free
+    places, zero = _places(rows), jax.tree.map(jnp.zeros_like, free)
 
     def residual(together: Array) -> Array:
         def moved(of_kind: Array | np.ndarray, kind: str) -> Array:
@@ -112,28 +93,50 @@ def add_second_derivatives(
         )
         return prior.residual(unknowns.retract(step))
 
-    start = jnp.zeros(sum(sizes), unknowns.points.dtype)
+    start = jnp.zeros(max(place.stop for place in places.values()), unknowns.points.dtype)
     value, by = residual(start), jax.jacfwd(residual)(start)
     _, slope, bent = prior.loss.derivatives(sum_components(value**2))
     second = jax.jacfwd(jax.jacfwd(lambda together: jnp.sum(slope * value * residual(together), axis=0)))(start)
     through = jnp.einsum("cn,cni->ni", value, by)
     hessian = jnp.einsum("n,cni,cnj->nij", slope, by, by) + second
     hessian += 2 * bent[:, None, None] * through[:, :, None] * through[:, None]
-    masks = {"pose": system.free.poses, "intrinsics": system.free.intrinsics, "point": system.free.points}
+    masks = {"pose": free.poses, "intrinsics": free.intrinsics, "point": free.points}
     for kind, place in places.items():
-        mask = system.free.lever_arm[None] if kind == "lever_arm" else rows_of(masks[kind], index[kind])
+        mask = free.lever_arm[None] if kind == "lever_arm" else rows_of(masks[kind], getattr(rows, kind).index)
         hessian = hessian.at[:, place].multiply(mask[:, :, None]).at[:, :, place].multiply(mask[:, None])
+    return _add(blocks, rows, hessian)
+
+
+def _by_kind(rows: Rows) -> dict[str, Float[Array, "components columns rows"]]:
+    """Return the derivatives by each kind of unknown that the rows touch."""
+    blocks = {"pose": rows.pose, "intrinsics": rows.intrinsics, "point": rows.point}
+    found = {kind: block.jacobian for kind, block in blocks.items() if block is not None}
+    return found if rows.lever_arm is None else {**found, "lever_arm": rows.lever_arm}
+
+
+def _places(rows: Rows) -> dict[str, slice]:
+    """Return where each kind's columns stand when all stand side by side."""
+    sizes = {kind: jacobian.shape[1] for kind, jacobian in _by_kind(rows).items()}
+    ends = np.cumsum(list(sizes.values()))
+    return {kind: slice(int(end) - size, int(end)) for (kind, size), end in zip(sizes.items(), ends, strict=True)}
+
+
+def _add(blocks: PriorBlocks, rows: Rows, matrix: Float[Array, "rows columns columns"]) -> PriorBlocks:
+    """Add a matrix of each row, over the columns of `_places`, to what the row touches."""
+    places = _places(rows)
 
     def square(total: Array, kind: str) -> Array:
         if kind not in places:
             return total
-        return total + segments(hessian[:, places[kind], places[kind]], index[kind], total.shape[0])
+        of_kind = matrix[:, places[kind], places[kind]]
+        return total + segments(of_kind, getattr(rows, kind).index, total.shape[0])
 
     lever_arm, cross = blocks.lever_arm, blocks.poses_lever_arm
     if "lever_arm" in places:
-        lever_arm += jnp.sum(hessian[:, places["lever_arm"], places["lever_arm"]], axis=0)
-        if "pose" in places:
-            cross += segments(hessian[:, places["pose"], places["lever_arm"]], index["pose"], cross.shape[0])
+        lever_arm += jnp.sum(matrix[:, places["lever_arm"], places["lever_arm"]], axis=0)
+        if rows.pose is not None:
+            across = matrix[:, places["pose"], places["lever_arm"]]
+            cross += segments(across, rows.pose.index, cross.shape[0])
     return PriorBlocks(
         square(blocks.poses, "pose"),
         square(blocks.intrinsics, "intrinsics"),

@@ -77,7 +77,7 @@ def tune(
     - `loss`: with its start values. `learn`: of `loss scale`, `loss shape` (of `Barron`), `pixel sigmas`, and
       `position sigmas` and the like for each prior.
     - `check_points`: indices and true coordinates of points whose coordinates the fit does not know, or
-    - `hold_out`: the share of the observations to leave out of the fit; a point keeps two.
+    - `hold_out`: the share of the observations to leave out of the fit, fewer where points would not keep two each.
     - `optimizer`: of optax; `optax.adam(learning_rate)` if None.
     - `starts`: how many descents, from start values spread by a factor of e, at once (`vmap`). `seed`: of the starts
       and of what is held out.
@@ -140,7 +140,11 @@ def tune(
                 raise
             stopped = str(error)
         if not history or not np.isfinite(best[0]):
-            raise JaxbaError(f"tune: no score was reached{': ' + stopped if stopped else ''}.")
+            why = stopped or "every score was not finite"
+            raise JaxbaError(
+                f"tune: no score was reached ({why}). See that jaxba.solve converges with this loss, or start from a "
+                "wider scale."
+            )
     tuned_problem, tuned_loss = _apply(problem, loss, learn, best[1], np)
     poses, cameras, points, lever_arm = jax.device_get(best[2])
     tuned_problem = eqx.tree_at(

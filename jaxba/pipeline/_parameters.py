@@ -46,6 +46,18 @@ def allowed(field: dataclasses.Field) -> str:
     return "" if high is None else f"{high:g} or less"
 
 
+def taken(cls: type[Parameters], name: str, value: Any) -> Any:
+    """Return a value from a file as the parameter `name` has it: a text is parsed, 2 is taken for 2.0."""
+    if isinstance(value, str):
+        return parse(cls, name, value)
+    kinds, optional = _kinds(get_type_hints(cls)[name])
+    if type(value) is int and int not in kinds and float in kinds:
+        return float(value)
+    if type(value) not in kinds:
+        raise JaxbaError(f"{stage_name(cls)}.{name}={value}: give {_kind_text(kinds, optional)}.")
+    return value
+
+
 def parse(cls: type[Parameters], name: str, text: str) -> Any:
     """Return the value of the parameter `name` that a text such as `0.7`, `true` or `none` means."""
     kinds, optional = _kinds(get_type_hints(cls)[name])
@@ -66,8 +78,8 @@ def parse(cls: type[Parameters], name: str, text: str) -> Any:
 
 
 def stage_name(cls: type[Parameters]) -> str:
-    """Return the name of the stage whose parameters these are: that of its module."""
-    return cls.__module__.rpartition(".")[2]
+    """Return the name of the stage or section whose parameters these are: that of its module."""
+    return cls.__module__.rpartition(".")[2].lstrip("_")
 
 
 def _check(cls: type[Parameters], field: dataclasses.Field, value: Any) -> None:

@@ -1,33 +1,54 @@
 """The project folder: where each stage's work lies, and which photos the folder of photos holds.
 
 project/
-  settings.json        the parameters of the last run
+  jaxba.toml           every parameter of the last run
+  run.json             the folders and lists that it was given, and the stage that it is in
   photos.json          size, time and SHA-256 of each file, so that a file is read again only when it changed
   stages/<stage>/      what the stage made; features and match hold a folder a photo
   export/              the results
   summary.json         what became of each stage and each photo
+  .lock                held by the run that works here
 """
 
+import contextlib
 import hashlib
 import json
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._store import cannot_write
+from jaxba.pipeline._store import cannot_write, remove_leftovers, sha256
 from jaxba.scene import PhotoFile
 
+SETTINGS, SUMMARY = "jaxba.toml", "summary.json"
+_RUN, _PHOTOS = "run.json", "photos.json"
 _GEOTAGS = "geo.txt"
 _LONGEST_NAME = 180  # bytes of a folder's name, which mostly may have 255
 
 
-class Project:
-    """Paths of a project folder, which is made if it is not there."""
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """What a run was given beside its parameters: the folder of photos, and a list that replaces their tags."""
 
-    def __init__(self, folder: Path) -> None:
+    photos: Path
+    geotags: Path | None = None
+
+
+class Project:
+    """Paths of a project folder, which is made if it is not there; with `make` off one that must be there."""
+
+    def __init__(self, folder: Path, *, make: bool = True) -> None:
         self.folder = folder
         self.export = folder / "export"
+        if make:
+            self._make(folder)
+        elif not (folder / _RUN).is_file():
+            raise JaxbaError(f"{folder}: is no project; give the folder that `jaxba run --out` was given.")
+
+    @staticmethod
+    def _make(folder: Path) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             probe = folder / f".{os.getpid()}.probe"
@@ -45,12 +66,39 @@ class Project:
         folder = self.folder / "stages" / name
         return folder if photo is None else folder / _folder_name(photo)
 
+    def remove_leftovers(self) -> None:
+        """Remove what a run that was killed left half written."""
+        stages = self.folder / "stages"
+        for folder in (self.folder, stages, *(path for path in stages.glob("*") if path.is_dir())):
+            remove_leftovers(folder)
+
+    def write_given(self, given: Given, stage: str | None) -> None:
+        """Write what a run was given and the stage that it is in; None: it has ended."""
+        paths = {name: None if path is None else str(path.absolute()) for name, path in vars(given).items()}
+        self.write_json(_RUN, {**paths, "stage": stage})
+
+    def read_given(self) -> tuple[Given, str | None]:
+        """Return what the last run was given, and the stage in which it was killed, or is now; None where it ended."""
+        content = self.read_json(_RUN)
+        if not isinstance(content, dict) or "stage" not in content:
+            raise JaxbaError(f"{self.folder / _RUN}: is damaged; run again.")
+        geotags = content["geotags"]
+        given = Given(photos=Path(content["photos"]), geotags=None if geotags is None else Path(geotags))
+        return given, content["stage"]
+
     def write_json(self, name: str, content: object) -> None:
-        """Write a JSON file of the project, whole or not at all."""
+        """Write a JSON file of the project, whole or not at all, where it changes."""
+        self.write_text(name, json.dumps(content, indent=1) + "\n")
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a text file of the project, whole or not at all, where it changes."""
         path = self.folder / name
         partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        with contextlib.suppress(OSError):
+            if path.read_bytes() == text.encode():
+                return
         try:
-            partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            partial.write_bytes(text.encode())
             partial.replace(path)
         except OSError as error:
             partial.unlink(missing_ok=True)
@@ -63,14 +111,14 @@ class Project:
         except (OSError, ValueError):
             return None
 
-    def photo_files(self, photos: Path) -> tuple[PhotoFile, ...]:
+    def photo_files(self, photos: Path, *, remember: bool = True) -> tuple[PhotoFile, ...]:
         """Return the files below the folder of photos, by name, with the SHA-256 of each.
 
-        A file whose size and time are those of the last run is not read again. Hidden files and the project itself,
-        where it lies inside the folder, are passed over.
+        A file whose size and time are those of the last run is not read again, and with `remember` those of this one
+        are kept. Hidden files and the project itself, where it lies inside the folder, are passed over.
         """
         paths = _files_below(photos, self.folder)
-        known = self.read_json("photos.json")
+        known = self.read_json(_PHOTOS)
         known = known if isinstance(known, dict) else {}
         found, table = [], {}
         for name, path in paths:
@@ -78,15 +126,15 @@ class Project:
                 stat = path.stat()
                 stamp = [stat.st_size, stat.st_mtime_ns]
                 before = known.get(name)
-                digest = before[2] if isinstance(before, list) and before[:2] == stamp else _sha256(path)
+                digest = before[2] if isinstance(before, list) and before[:2] == stamp else sha256(path)
             except OSError as error:
                 raise JaxbaError(
                     f"{path}: cannot be read ({error.strerror}); check its permissions, or delete it."
                 ) from error
             table[name] = [*stamp, digest]
             found.append(PhotoFile(name=name, path=path.absolute(), sha256=digest))
-        if table != known:
-            self.write_json("photos.json", table)
+        if remember:
+            self.write_json(_PHOTOS, table)
         return tuple(found)
 
 
@@ -142,8 +190,3 @@ def _folder_name(photo: str) -> str:
     if len(name.encode()) <= _LONGEST_NAME:
         return name
     return f"{name.encode()[:_LONGEST_NAME].decode(errors='ignore')}-{hashlib.sha256(photo.encode()).hexdigest()[:16]}"
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

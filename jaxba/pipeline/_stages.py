@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxba.pipeline import adjust, crs, export, features, match, metadata, pairs, start, tracks
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
+from jaxba.pipeline._key import Key
 from jaxba.pipeline._store import Stored, load
 from jaxba.scene import Left, PhotoFile, Reference, ViewGraph
 
@@ -56,11 +57,11 @@ class Done:
 
 @dataclass(frozen=True)
 class PhotoItem:
-    """The inputs of one photo, what of them counts for the fingerprint, and the photo's size."""
+    """The inputs of one photo, what of them counts, by name, and the photo's size."""
 
     name: str
     inputs: Any
-    identity: Any
+    identity: dict[str, Any]
     megapixels: float
 
 
@@ -93,7 +94,7 @@ def _crs(done: Done) -> crs.Inputs:
 
 def _features(done: Done) -> list[PhotoItem]:
     return [
-        PhotoItem(photo.name, features.Inputs(photo=photo), (photo.sha256, photo.width_px), photo.megapixels)
+        PhotoItem(photo.name, features.Inputs(photo=photo), {"photo": (photo.sha256, photo.width_px)}, photo.megapixels)
         for photo in done.photos
     ]
 
@@ -140,11 +141,15 @@ def _match(done: Done) -> list[PhotoItem]:
             reference=_reference_of(reference, images, with_heights=is_orb),
             features=done.features.only(images),
         )
-        shapes = [(entry.focal_px, entry.width_px, entry.height_px) for entry in photos]
-        identity = (shapes, inputs.overlap, inputs.reference, inputs.features)
+        identity = {
+            "cameras": [(entry.focal_px, entry.width_px, entry.height_px) for entry in photos],
+            "overlap": inputs.overlap,
+            "positions and attitudes": inputs.reference,
+            "features": inputs.features,
+        }
         megapixels = 1.0
         if np.isfinite(inputs.reference.height_above_ground_m[0]):
-            identity = (*identity, [entry.sha256 for entry in photos])
+            identity["photos"] = [entry.sha256 for entry in photos]
             megapixels = max(entry.megapixels for entry in photos)
         items.append(PhotoItem(photo.name, inputs, identity, megapixels))
     return items
@@ -223,7 +228,7 @@ STAGES = (
 NAMES = tuple(stage.name for stage in STAGES)
 
 
-def run_photo(module: str, folder: Any, inputs: Any, params: Any, key: str) -> str | None:
+def run_photo(module: str, folder: Any, inputs: Any, params: Any, key: Key) -> str | None:
     """Run a stage for one photo in a worker and save what it makes; return why it could not, or None."""
     from jaxba._errors import JaxbaError
     from jaxba.pipeline._store import save, save_failure

@@ -1,16 +1,18 @@
 """What a stage made, as a folder: `record.json` and an `.npy` file an array; whole, or not there at all.
 
 A folder is written beside its place and renamed; `record.json` holds the key under which it was made, so that the same
-work is recognised. Arrays are memory-mapped when they are read: opening a block of 100 MB costs a millisecond, and the
-features of 500 photos need no memory until they are looked at.
+work is recognised, and a checksum of every file and of itself, so that damage is noticed. Arrays are memory-mapped when
+they are read: opening a block of 100 MB costs a millisecond, and the features of 500 photos need no memory until they
+are looked at. Checking those of 500 photos (600 MB) takes under a second.
 """
 
 import errno
+import hashlib
 import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -20,10 +22,12 @@ from jaxtyping import AbstractArray
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._fingerprint import fingerprint
+from jaxba.pipeline._key import Key
 
 T = TypeVar("T")
 _RECORD = "record.json"
 _ARRAY = "__npy__"
+_PARTIAL, _OLD = ".partial", ".old"
 
 
 @dataclass(frozen=True)
@@ -33,12 +37,12 @@ class Record:
     - `key`: what it was made from. `digest`: of its contents. `failed`: why nothing could be made, else None.
     """
 
-    key: str
+    key: Key
     digest: str
     failed: str | None = None
 
 
-def save(folder: Path, value: Any, key: str) -> Record:
+def save(folder: Path, value: Any, key: Key) -> Record:
     """Write a dataclass as a folder, in place of what was there; return its record."""
     record = Record(key, fingerprint(value))
     with written_whole(folder) as partial:
@@ -47,7 +51,7 @@ def save(folder: Path, value: Any, key: str) -> Record:
     return record
 
 
-def save_failure(folder: Path, reason: str, key: str) -> Record:
+def save_failure(folder: Path, reason: str, key: Key) -> Record:
     """Write that nothing could be made and why, so that the next run need not try again."""
     record = Record(key, fingerprint(reason), reason)
     with written_whole(folder) as partial:
@@ -58,7 +62,33 @@ def save_failure(folder: Path, reason: str, key: str) -> Record:
 def read_record(folder: Path) -> Record | None:
     """Return the record of a folder; None where there is none or it is damaged."""
     content = _content(folder)
-    return None if content is None else Record(content["key"], content["digest"], content["failed"])
+    return None if content is None else Record(Key(**content["key"]), content["digest"], content["failed"])
+
+
+def damage(folder: Path) -> str | None:
+    """Return in words what of a folder is damaged, after reading all of it; None where it is whole."""
+    content = _content(folder)
+    if content is None:
+        return f"{_RECORD} is missing or damaged"
+    return damaged_file(folder, content["files"])
+
+
+def damaged_file(folder: Path, checksums: Mapping[str, str]) -> str | None:
+    """Return the first of some files that is missing or has another checksum, in words; None where none has."""
+    for name, checksum in checksums.items():
+        try:
+            found = sha256(folder / name)
+        except OSError:
+            return f"{name} is missing"
+        if found != checksum:
+            return f"{name} is damaged"
+    return None
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file's contents, hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def load(folder: Path, cls: type[T]) -> T:
@@ -97,8 +127,8 @@ class written_whole:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-        self.old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+        self.partial = folder.with_name(f".{folder.name}.{os.getpid()}{_PARTIAL}")
+        self.old = folder.with_name(f".{folder.name}.{os.getpid()}{_OLD}")
 
     def __enter__(self) -> Path:
         shutil.rmtree(self.partial, ignore_errors=True)
@@ -121,6 +151,13 @@ class written_whole:
         shutil.rmtree(self.old, ignore_errors=True)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove what a process that was killed left beside the folders in a folder; no other process may be writing."""
+    for place in folder.glob(".*"):
+        if place.name.endswith((_PARTIAL, _OLD)):
+            shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
+
+
 def cannot_write(path: Path, error: OSError) -> JaxbaError:
     """Return the error that says why a file could not be written and what to do."""
     cures = {
@@ -135,7 +172,9 @@ def cannot_write(path: Path, error: OSError) -> JaxbaError:
 
 
 def _write_record(folder: Path, record: Record, tree: Any) -> None:
-    content = {"key": record.key, "digest": record.digest, "failed": record.failed, "value": tree}
+    files = {path.name: sha256(path) for path in sorted(folder.iterdir())}
+    content = json.loads(json.dumps({**asdict(record), "value": tree, "files": files}))  # as it will be read
+    content["checksum"] = _checksum(content)
     with open(folder / _RECORD, "w", encoding="utf-8") as file:
         json.dump(content, file, indent=1)
         file.flush()
@@ -147,7 +186,13 @@ def _content(folder: Path) -> dict[str, Any] | None:
         content = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return content if isinstance(content, dict) and {"key", "digest", "failed", "value"} <= content.keys() else None
+    is_whole = isinstance(content, dict) and content.pop("checksum", None) == _checksum(content)
+    return content if is_whole else None
+
+
+def _checksum(content: dict[str, Any]) -> str:
+    """Return the checksum of a record's other entries."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _arrays_to_files(tree: Any, folder: Path, name: str) -> Any:

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from jaxba.pipeline import adjust
 from jaxba.pipeline._parameters import Parameters
+from jaxba.pipeline._store import sha256
 from jaxba.scene import Block, LocalFrame, Photo, Reference
 
 
@@ -34,9 +35,13 @@ class Params(Parameters):
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """- `files`: names of what was written, below the folder. `notes`: what a reader of the files should know."""
+    """What was written.
+
+    - `files`: names, below the folder. `sha256`: of each. `notes`: what a reader of the files should know.
+    """
 
     files: tuple[str, ...]
+    sha256: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
 
@@ -72,7 +77,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     _write(folder / "cloud.png", _picture(inputs, cloud, frame))
     _write(folder / "README.txt", _readme(notes).encode())
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    return Outputs(files=tuple(files), notes=tuple(notes))
+    return Outputs(files=tuple(files), sha256=tuple(sha256(folder / name) for name in files), notes=tuple(notes))
 
 
 def _in_crs(frame: LocalFrame | None, xyz_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

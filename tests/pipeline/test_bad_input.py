@@ -152,7 +152,7 @@ def test_a_target_crs_that_cannot_be_meant_is_refused(made: Survey, tmp_path: Pa
 
 
 def test_unknown_parameters_are_refused_with_the_known_ones():
-    with pytest.raises(JaxbaError, match=r"did you mean ratio\? The parameters of match are ratio"):
+    with pytest.raises(JaxbaError, match=r"no parameter match\.rato; did you mean ratio\? the parameters of match are ratio"):
         changed(default_settings(), ["match.rato=0.7"])
 
 
@@ -208,7 +208,7 @@ def test_a_file_that_cannot_be_read_stops_the_run_by_name(
     def fail(path: Path) -> str:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
-    monkeypatch.setattr("jaxba.pipeline._project._sha256", fail)
+    monkeypatch.setattr("jaxba.pipeline._project.sha256", fail)
     with pytest.raises(JaxbaError, match=r"SIM_0001\.JPG: cannot be read \(Permission denied\); check its permissions"):
         Survey(made.photos, tmp_path / "project").run(until="metadata")
 

@@ -19,6 +19,7 @@ from small_survey import Survey
 from jaxba.pipeline import STAGES, _store
 from jaxba.pipeline._events import Run
 from jaxba.pipeline._fingerprint import fingerprint
+from jaxba.pipeline._key import Key
 from jaxba.pipeline._parameters import Parameters
 from jaxba.pipeline._stages import Stage
 
@@ -95,7 +96,7 @@ def test_a_stage_is_pure(stage: Stage, done: Run, made: Survey, tmp_path: Path, 
     assert before == (fingerprint(inputs), tree(made.project), tree(made.photos))
     assert isinstance(outputs, stage.module.Outputs) and fingerprint(outputs) == digest
     assert list((tmp_path / "cwd").iterdir()) == []
-    _store.save(tmp_path / "saved", outputs, "key")
+    _store.save(tmp_path / "saved", outputs, Key("code", {}, {}))
     assert fingerprint(_store.load(tmp_path / "saved", stage.module.Outputs)) == digest
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from jaxba import JaxbaError
 from jaxba.pipeline import _project
-from jaxba.pipeline._project import Project, read_geotags
+from jaxba.pipeline._project import Given, Project, read_geotags
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_a_file_is_read_again_only_when_its_size_or_time_changed(photos: Path, t
         read.append(path.name)
         return hashlib.sha256(path.read_bytes()).hexdigest()
 
-    monkeypatch.setattr(_project, "_sha256", digest)
+    monkeypatch.setattr(_project, "sha256", digest)
     project = Project(tmp_path / "project")
     first = project.photo_files(photos)
     assert project.photo_files(photos) == first and sorted(read) == ["a.jpg", "b.JPG"]
@@ -65,12 +65,12 @@ def test_every_photo_has_a_folder_of_its_own_whatever_its_name(tmp_path: Path):
 
 def test_json_is_written_whole_or_not_at_all(tmp_path: Path):
     project = Project(tmp_path)
-    project.write_json("settings.json", {"ä": 1})
-    assert project.read_json("settings.json") == {"ä": 1} == json.loads((tmp_path / "settings.json").read_text())
+    project.write_json("photos.json", {"ä": 1})
+    assert project.read_json("photos.json") == {"ä": 1} == json.loads((tmp_path / "photos.json").read_text())
     with pytest.raises(TypeError):
-        project.write_json("settings.json", {"ä": object()})
-    assert project.read_json("settings.json") == {"ä": 1} and project.read_json("none.json") is None
-    assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
+        project.write_json("photos.json", {"ä": object()})
+    assert project.read_json("photos.json") == {"ä": 1} and project.read_json("none.json") is None
+    assert [path.name for path in tmp_path.iterdir()] == ["photos.json"]
 
 
 def test_geotags_are_those_given_else_geo_txt_among_the_photos(photos: Path, tmp_path: Path):
@@ -84,3 +84,31 @@ def test_geotags_are_those_given_else_geo_txt_among_the_photos(photos: Path, tmp
         read_geotags(photos, tmp_path / "latin.csv")
     with pytest.raises(JaxbaError, match=r"gone\.csv: there is no such file"):
         read_geotags(photos, tmp_path / "gone.csv")
+
+
+def test_what_a_run_was_given_and_the_stage_that_it_is_in_are_kept(tmp_path: Path):
+    project = Project(tmp_path)
+    given = Given(photos=tmp_path / "photos", geotags=None)
+    project.write_given(given, "match")
+    assert Project(tmp_path, make=False).read_given() == (given, "match")
+    project.write_given(given, None)
+    assert project.read_given()[1] is None
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(JaxbaError, match=r"run\.json: is damaged; run again"):
+        project.read_given()
+    with pytest.raises(JaxbaError, match=r"none: is no project; give the folder that `jaxba run --out` was given"):
+        Project(tmp_path / "none", make=False)
+    assert not (tmp_path / "none").exists()
+
+
+def test_what_a_killed_run_left_half_written_is_removed_and_nothing_else(tmp_path: Path):
+    project = Project(tmp_path)
+    kept = [project.stage("features", "a.partial.jpg"), project.stage("pairs"), project.export]
+    left = [folder.with_name(f".{folder.name}.123{end}") for folder in kept for end in (".partial", ".old")]
+    for folder in (*kept, *left):
+        folder.mkdir(parents=True)
+        (folder / "array.npy").touch()
+    (tmp_path / ".summary.json.123.partial").touch()
+    project.remove_leftovers()
+    assert [folder.exists() for folder in kept] == [True] * 3 and not any(folder.exists() for folder in left)
+    assert not (tmp_path / ".summary.json.123.partial").exists()

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_survey import NUM_PHOTOS, Survey
+from small_survey import FAST, NUM_PHOTOS, Survey
 
 from jaxba import JaxbaError
-from jaxba.pipeline import NAMES, Event, adjust, default_settings, run_pipeline, start, summary
+from jaxba.pipeline import NAMES, Event, adjust, changed, default_settings, run_pipeline, start, summary
 from jaxba.pipeline._fingerprint import fingerprint
+from jaxba.pipeline._settings import from_toml
 
 FIRST, LAST = "SIM_0001.JPG", f"SIM_{NUM_PHOTOS:04d}.JPG"
 
@@ -221,7 +222,7 @@ def test_an_export_folder_that_was_removed_is_written_again(made: Survey, tmp_pa
 
 
 def test_parameters_of_the_last_run_lie_in_the_project(made: Survey):
-    assert json.loads((made.project / "settings.json").read_text())["features"]["nfeatures"] == 2000
+    assert from_toml(made.project / "jaxba.toml", default_settings()) == changed(default_settings(), FAST)
 
 
 def test_a_project_folder_is_not_the_photo_folder(photos: Path):

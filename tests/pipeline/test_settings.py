@@ -5,6 +5,7 @@ import pytest
 from jaxba import JaxbaError
 from jaxba.pipeline import STAGES, changed, default_settings
 from jaxba.pipeline._parameters import Parameters, allowed, parameter
+from jaxba.pipeline._settings import explained, from_toml, to_toml
 
 EVERY = [(stage, field) for stage in STAGES for field in dataclasses.fields(stage.module.Params)]
 
@@ -33,10 +34,11 @@ def test_a_change_changes_that_parameter_alone(text, value):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("match.ratio", "write stage.name=value"),
-        ("ratio=0.7", "write stage.name=value"),
-        ("matches.ratio=0.7", "no stage 'matches'; the stages are metadata, crs"),
-        ("match.rato=0.7", "did you mean ratio?"),
+        ("match.ratio", "write section.name=value"),
+        ("ratio=0.7", "write section.name=value"),
+        ("matches.ratio=0.7", "no section 'matches'; did you mean match"),
+        ("tie.ratio=0.7", "the sections, each a table in TOML, are metadata, crs"),
+        ("match.rato=0.7", "no parameter match.rato; did you mean ratio"),
         ("match.ratio=0.9", "match.ratio=0.9 is out of range; allowed: 0.6 to 0.85"),
         ("match.ratio=nan", "out of range"),
         ("match.ratio=high", "match.ratio=high: give a number"),
@@ -64,3 +66,56 @@ def test_allowed_says_ranges_in_words():
         c: str = parameter("x", help="anything")
 
     assert [allowed(field) for field in dataclasses.fields(Params)] == ["1 or more", "2 or less", ""]
+
+
+def test_a_toml_of_all_settings_reads_back_as_they_were(tmp_path):
+    settings = changed(default_settings(), ["match.ratio=0.7", 'crs.target_crs=a "b" \\ c', "adjust.ftol=1e-9"])
+    for explain in (False, True):
+        (tmp_path / "jaxba.toml").write_text(to_toml(settings, explain=explain))
+        assert from_toml(tmp_path / "jaxba.toml", default_settings()) == settings
+
+
+def test_a_toml_changes_what_it_names_and_nothing_else(tmp_path):
+    (tmp_path / "a.toml").write_text("[match]\nransac_threshold = 2\n[features]\nnfeatures = 3000\n")
+    before = changed(default_settings(), ["match.ratio=0.7"])
+    after = from_toml(tmp_path / "a.toml", before)
+    assert after == changed(before, ["match.ransac_threshold=2", "features.nfeatures=3000"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[match]\nratio = 0.9\n", r"a\.toml: match\.ratio=0\.9 is out of range; allowed: 0\.6 to 0\.85"),
+        (
+            "[match]\nrato = 0.7\n",
+            r"a\.toml: no parameter match\.rato; did you mean ratio\? the parameters of",
+        ),
+        ("[macht]\nratio = 0.7\n", r"a\.toml: no section 'macht'; did you mean match\? the sections"),
+        ("ratio = 0.7\n", r"a\.toml: no section 'ratio'"),
+        ("match = 3\n", r"a\.toml: no section 'match'"),
+        ("[match]\nmin_inliers = 12.5\n", r"a\.toml: match\.min_inliers=12\.5: give a whole number"),
+        ("[match]\nratio = [1]\n", r"a\.toml: match\.ratio=\[1\]: give a number"),
+        ("[match\n", r"a\.toml: is no TOML .*line 1"),
+    ],
+)
+def test_a_bad_toml_is_refused_with_the_file_and_what_is_allowed(tmp_path, text, message):
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(JaxbaError, match=message):
+        from_toml(tmp_path / "a.toml", default_settings())
+
+
+def test_a_toml_that_is_not_there_or_no_text_is_refused(tmp_path):
+    with pytest.raises(JaxbaError, match=r"a\.toml: there is no such file"):
+        from_toml(tmp_path / "a.toml", default_settings())
+    (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(JaxbaError, match=r"b\.toml: cannot be read as text"):
+        from_toml(tmp_path / "b.toml", default_settings())
+
+
+def test_every_parameter_is_explained_once():
+    rows = explained(default_settings())
+    assert len({name for name, *_ in rows}) == len(rows)
+    assert dict((name, (default, range_)) for name, default, range_, _ in rows)["match.ratio"] == (
+        "0.75",
+        "0.6 to 0.85",
+    )

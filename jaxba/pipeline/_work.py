@@ -1,0 +1,97 @@
+"""What there is to do: the works of a stage, one in all or one a photo, and which of them are done and current.
+
+A work is current when its record has the key that it would be made under now, and its files are as they were written.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxba.pipeline import _store
+from jaxba.pipeline._key import Key, by_field, what_changed
+from jaxba.pipeline._parameters import Parameters
+from jaxba.pipeline._project import Project
+from jaxba.pipeline._stages import Done, Stage
+from jaxba.scene import Left
+
+
+@dataclass(frozen=True)
+class Work:
+    """The work of a stage, or of one photo of it.
+
+    - `photo`: its name; None for a stage that does all photos at once. `folder`: where what it makes lies.
+    - `megapixels`: of the photo.
+    """
+
+    photo: str | None
+    folder: Path
+    key: Key
+    inputs: Any
+    megapixels: float = 0.0
+
+    @property
+    def record(self) -> _store.Record | None:
+        """The record under the present key; None where there is none. Its files may be damaged."""
+        record = _store.read_record(self.folder)
+        return record if record is not None and record.key == self.key else None
+
+
+def works(project: Project, stage: Stage, done: Done, params: Parameters) -> list[Work]:
+    """Return the works of a stage, from what the stages before it have made."""
+    module = stage.module.__name__
+    if stage.collect is None:
+        inputs = stage.inputs(done)
+        values = by_field(inputs)
+        if stage.name == "metadata":  # which keeps where the photos are
+            values["places"] = [str(file.path) for file in done.files]
+        return [Work(None, project.stage(stage.name), Key.of(module, params, values), inputs)]
+    return [
+        Work(
+            item.name,
+            project.stage(stage.name, item.name),
+            Key.of(module, params, item.identity),
+            item.inputs,
+            item.megapixels,
+        )
+        for item in stage.inputs(done)
+    ]
+
+
+def why_to_do(project: Project, stage: Stage, work: Work, params: Parameters) -> str | None:
+    """Return in words why a work has to be done; None where it is done and current."""
+    record = _store.read_record(work.folder)
+    if record is None:
+        return "its record is damaged" if work.folder.exists() else "not done yet"
+    if record.key != work.key:
+        return what_changed(record.key, work.key, params)
+    if damage := _store.damage(work.folder):
+        return damage
+    if stage.name == "export":
+        outputs = _store.load(work.folder, stage.module.Outputs)
+        return _store.damaged_file(project.export, dict(zip(outputs.files, outputs.sha256, strict=True)))
+    return None
+
+
+def collected(stage: Stage, done: Done, items: Sequence[Work]) -> tuple[Any, tuple[Left, ...]]:
+    """Return what a stage made, all of whose works have been done, and the photos that it could make nothing of."""
+    if stage.collect is None:
+        return _store.load(items[0].folder, stage.module.Outputs), ()
+    index = {photo.name: i for i, photo in enumerate(done.photos)}
+    folders, digests, left = {}, {}, []
+    for item in items:
+        record, name = item.record, item.photo
+        if record is None or name is None:
+            continue
+        if record.failed is not None:
+            left.append(Left(name=name, reason=without_path(name, record.failed)))
+            continue
+        folders[index[name]], digests[index[name]] = item.folder, record.digest
+    outputs = stage.collect(done, folders, digests)
+    return outputs, tuple(left)
+
+
+def without_path(name: str, reason: str) -> str:
+    """Return a reason without the photo's path before it, which is said beside it, and may have changed since."""
+    before, found, after = reason.partition(name)
+    return after.lstrip(": ") if found and (not before or before.endswith(("/", "\\"))) else reason

@@ -30,6 +30,15 @@ app = App(
 )
 
 _File = Annotated[Path, Parameter(help="A tile.npz, or a BAL problem, text or bz2.")]
+_Config = Annotated[
+    Path | None, Parameter(help="Parameters in TOML, a table a stage. [default: jaxba.toml in the working folder]")
+]
+_Set = Annotated[
+    tuple[str, ...],
+    Parameter(name="--set", negative="", show_default=False, help="A parameter: match.ratio=0.7; once for each."),
+]
+_Project = Annotated[Path, Parameter(help="The project folder of a run.")]
+_Json = Annotated[bool, Parameter(negative="", show_default=False, help="Print one JSON object on standard output.")]
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -109,10 +118,8 @@ def run(
     crs: Annotated[str | None, Parameter(help="Projected CRS of the results: EPSG:32615. [default: UTM]")] = None,
     out: Annotated[Path, Parameter(help="The project folder.")] = Path("project"),
     stage: Annotated[str | None, Parameter(help="Stop after this stage: metadata, crs, features, pairs, ...")] = None,
-    set_: Annotated[
-        tuple[str, ...],
-        Parameter(name="--set", negative="", show_default=False, help="A parameter: match.ratio=0.7; once for each."),
-    ] = (),
+    config: _Config = None,
+    set_: _Set = (),
     focal: Annotated[float | None, Parameter(help="Focal length in pixels, in place of the tags'.")] = None,
     geotags: Annotated[
         Path | None, Parameter(help="A geo.txt or CSV in place of the tags. [default: geo.txt among the photos]")
@@ -134,6 +141,7 @@ def run(
     return run(
         photos,
         out=out,
+        config=config,
         crs=crs,
         focal=focal,
         geotags=geotags,
@@ -145,6 +153,36 @@ def run(
         as_json=json,
         quiet=quiet,
     )
+
+
+@app.command(
+    help="Tell how a project stands: stage by stage what is done, what is stale and why; failed frames and pairs.\n\n"
+    "Exit codes: 0 everything is done, 1 something is to be done, 2 no project."
+)
+def status(
+    project: _Project,
+    /,
+    *,
+    config: Annotated[Path | None, Parameter(help="Parameters to hold it against. [default: its last run's]")] = None,
+    set_: _Set = (),
+    json: _Json = False,
+) -> int:
+    from jaxba.cli._status import run
+
+    return run(project, config=config, changes=set_, as_json=json)
+
+
+@app.command(help="Print a jaxba.toml with every parameter: its default, range and one line of meaning.")
+def config(
+    file: Annotated[Path | None, Parameter(help="Print the settings of this file. [default: jaxba.toml here]")] = None,
+    /,
+    *,
+    explain: Annotated[bool, Parameter(negative="", show_default=False, help="A row a parameter instead.")] = False,
+    json: _Json = False,
+) -> int:
+    from jaxba.cli._config import run
+
+    return run(file, explain=explain, as_json=json)
 
 
 @app.command(help="Write a small simulated survey: photos with tags, control points, the truth beside them.")

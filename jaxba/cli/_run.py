@@ -2,27 +2,26 @@
 
 import math
 import re
-import shutil
 import sys
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxba.cli._cache import use_compilation_cache
+from jaxba.cli._config import configured
 from jaxba.cli._main import INTERRUPTED
-from jaxba.cli._text import first_of, many, to_json
-from jaxba.pipeline import Event, Resources, Run, changed, default_settings, run_pipeline, stage_lines, summary
+from jaxba.cli._text import first_of, many, to_json, wrapped
+from jaxba.pipeline import Event, Resources, Run, changed, run_pipeline, stage_lines, summary
 
 _CLEAR = "\r\x1b[K"
-_LABEL, _MOST_COLUMNS, _LONGEST_NOTE = 10, 120, 900
-_SUMMARY_LABEL = 12
+_LABEL, _SUMMARY_LABEL = 10, 12
 
 
 def run(
     photos: Path,
     *,
     out: Path,
+    config: Path | None,
     crs: str | None,
     focal: float | None,
     geotags: Path | None,
@@ -35,7 +34,7 @@ def run(
     quiet: bool,
 ) -> int:
     """Run the pipeline and say what came out; return the exit code."""
-    settings = changed(default_settings(), changes)
+    settings = changed(configured(config, quiet=quiet or as_json), changes)
     for flag, given in (
         (f"crs.target_crs={crs}", crs is not None),
         (f"metadata.focal={focal}", focal is not None),
@@ -84,10 +83,10 @@ class _Progress:
             self.clear()
             if event.total:
                 first, *notes = stage_lines(event)
-                print(_wrapped(event.stage, f"{first}   {event.seconds:.1f} s"), flush=True)
+                print(wrapped(event.stage, f"{first}   {event.seconds:.1f} s", _LABEL), flush=True)
                 for note in notes:
                     if news := self._news(note):
-                        print(_wrapped("", news), flush=True)
+                        print(wrapped("", news, _LABEL), flush=True)
 
     def clear(self) -> None:
         """Wipe the line that is overwritten."""
@@ -100,22 +99,6 @@ class _Progress:
         news = [sentence for sentence in sentences if sentence not in self.said]
         self.said.update(sentences)
         return " ".join(news)
-
-
-def _wrapped(label: str, text: str, indent: int = _LABEL) -> str:
-    """Return a text beside its label, wrapped to the terminal; a very long one is cut."""
-    if len(text) > _LONGEST_NOTE:
-        text = textwrap.shorten(text, _LONGEST_NOTE, placeholder=" ... (the rest is in summary.json)")
-    width = max(min(shutil.get_terminal_size((_MOST_COLUMNS, 24)).columns, _MOST_COLUMNS), indent + 30)
-    lines = textwrap.wrap(
-        text,
-        width,
-        initial_indent=f"{label:<{indent}}",
-        subsequent_indent=" " * indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return "\n".join(lines)
 
 
 def _print_summary(result: Run, out: Path) -> None:
@@ -137,7 +120,7 @@ def _print_summary(result: Run, out: Path) -> None:
         print("nothing to do: the photos and settings are those of the last run")
     print()
     for label, text in rows:
-        print(_wrapped(label, text, _SUMMARY_LABEL))
+        print(wrapped(label, text, _SUMMARY_LABEL))
 
 
 def _result_rows(adjust: dict[str, Any]) -> list[tuple[str, str]]:

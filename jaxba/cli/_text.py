@@ -2,11 +2,14 @@
 
 import json
 import math
+import shutil
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 _LABEL_WIDTH = 12
+_MOST_COLUMNS, _LONGEST = 120, 900
 
 
 def to_json(facts: Mapping[str, object]) -> str:
@@ -52,3 +55,19 @@ def gauge_text(free: Sequence[str]) -> str:
     if not free:
         return "determined"
     return f"{many(len(free), 'direction')} free: {', '.join(free)}"
+
+
+def wrapped(label: str, text: str, indent: int) -> str:
+    """Return a text beside its label, wrapped to the terminal; a very long one is cut."""
+    if len(text) > _LONGEST:
+        text = textwrap.shorten(text, _LONGEST, placeholder=" ... (the rest is in summary.json)")
+    width = max(min(shutil.get_terminal_size((_MOST_COLUMNS, 24)).columns, _MOST_COLUMNS), indent + 30)
+    lines = textwrap.wrap(
+        text,
+        width,
+        initial_indent=f"{label:<{indent}}",
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return "\n".join(lines)

@@ -1,6 +1,7 @@
 """A small simulated survey and one run of the pipeline on it, shared by tests in all processes of a session."""
 
 import fcntl
+import io
 import os
 import shutil
 import time
@@ -8,7 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from jaxba.pipeline import Event, Resources, Run, changed, default_settings, run_pipeline
 from jaxba.pipeline.simulate import Params, write_survey
@@ -61,6 +64,17 @@ def once(folder: Path, name: str, make: Callable[[Path], None]) -> Path:
             make(place)
             (place / "done").touch()
     return place
+
+
+def repaint(path: Path, paint: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Change the pixels of a JPEG, keeping the segments of its tags as they are."""
+    content = path.read_bytes()
+    with Image.open(io.BytesIO(content)) as image:
+        pixels = paint(np.array(image))
+    changed = io.BytesIO()
+    Image.fromarray(pixels).save(changed, "JPEG", quality=95)
+    tables = b"\xff\xdb"
+    path.write_bytes(content[: content.index(tables)] + changed.getvalue()[changed.getvalue().index(tables) :])
 
 
 def make_photos(place: Path) -> None:

@@ -152,7 +152,7 @@ def test_a_target_crs_that_cannot_be_meant_is_refused(made: Survey, tmp_path: Pa
 
 
 def test_unknown_parameters_are_refused_with_the_known_ones():
-    with pytest.raises(JaxbaError, match=r"no parameter match\.rato; did you mean ratio\? the parameters of match are ratio"):
+    with pytest.raises(JaxbaError, match=r"match\.rato; did you mean ratio\? the parameters of match are ratio"):
         changed(default_settings(), ["match.rato=0.7"])
 
 

@@ -1,7 +1,6 @@
 """What a run does again and what it does not: a changed thing reruns what depends on it, and nothing else."""
 
 import dataclasses
-import io
 import json
 import os
 import shutil
@@ -10,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-from small_survey import FAST, NUM_PHOTOS, Survey
+from small_survey import FAST, NUM_PHOTOS, Survey, repaint
 
 from jaxba import JaxbaError
 from jaxba.pipeline import NAMES, Event, adjust, changed, default_settings, run_pipeline, start, summary
@@ -51,16 +49,9 @@ def exported(project: Path) -> dict[str, bytes]:
     return {path.relative_to(project / "export").as_posix(): path.read_bytes() for path in files}
 
 
-def change_pixels(path: Path) -> None:
-    """Blacken a corner of a JPEG, keeping the segments of its tags as they are."""
-    content = path.read_bytes()
-    with Image.open(io.BytesIO(content)) as image:
-        pixels = np.array(image)
+def blacken_a_corner(pixels: np.ndarray) -> np.ndarray:
     pixels[:120, :160] = 0
-    changed = io.BytesIO()
-    Image.fromarray(pixels).save(changed, "JPEG", quality=95)
-    tables = b"\xff\xdb"
-    path.write_bytes(content[: content.index(tables)] + changed.getvalue()[changed.getvalue().index(tables) :])
+    return pixels
 
 
 def test_a_run_adjusts_every_photo_and_says_so(made: Survey):
@@ -116,7 +107,7 @@ def test_another_target_crs_reruns_crs_and_export_alone(made: Survey, tmp_path: 
 
 def test_a_changed_photo_redoes_its_features_and_its_pairs_alone(made: Survey, tmp_path: Path, quick):
     survey = made.copy(tmp_path, photos=True)
-    change_pixels(survey.photos / FIRST)
+    repaint(survey.photos / FIRST, blacken_a_corner)
     before = inodes(survey.project / "stages")
     run = survey.run()
     anew = made_anew(before, inodes(survey.project / "stages"))

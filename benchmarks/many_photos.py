@@ -16,6 +16,7 @@ import numpy as np
 import psutil
 
 from jaxba.pipeline import Resources, default_settings, features, match
+from jaxba.pipeline._key import Key
 from jaxba.pipeline._stages import run_photo
 from jaxba.pipeline._store import Stored, load, save
 from jaxba.pipeline._workers import Item, work
@@ -23,6 +24,7 @@ from jaxba.scene import Features, Photo, Reference
 
 WIDTH_PX, HEIGHT_PX, KEYPOINTS = 4000, 3000, 8000
 PARTNERS = 4
+_KEY = Key("", {}, {})
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -68,7 +70,7 @@ def _write_features(folder: Path, count: int) -> tuple[tuple[Photo, ...], Stored
             coverage=1.0,
         )
         folders[image] = folder / "features" / str(image)
-        save(folders[image], features.Outputs(features=made), "")
+        save(folders[image], features.Outputs(features=made), _KEY)
         photos.append(
             Photo(
                 name=f"{image:04d}.jpg",
@@ -103,7 +105,7 @@ def _item(folder: Path, photos: tuple[Photo, ...], stored: Stored, image: int) -
         reference=reference,
         features=stored.only([image, *partners]),
     )
-    arguments = (match.__name__, folder / "match" / str(image), inputs, default_settings()["match"], "")
+    arguments = (match.__name__, folder / "match" / str(image), inputs, default_settings()["match"], _KEY)
     return Item(name=str(image), arguments=arguments, need_bytes=1e9)
 
 

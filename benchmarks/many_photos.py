@@ -17,9 +17,9 @@ import psutil
 
 from jaxba.pipeline import Resources, default_settings, features, match
 from jaxba.pipeline._key import Key
+from jaxba.pipeline._pool import Item, work
 from jaxba.pipeline._stages import run_photo
 from jaxba.pipeline._store import Stored, load, save
-from jaxba.pipeline._workers import Item, work
 from jaxba.scene import Features, Photo, Reference
 
 WIDTH_PX, HEIGHT_PX, KEYPOINTS = 4000, 3000, 8000

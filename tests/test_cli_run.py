@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from jaxba.cli import main
-from jaxba.cli._run import _Progress, _result_rows
+from jaxba.cli._run import _result_rows
+from jaxba.cli._run_progress import LiveLine
 from jaxba.pipeline import NAMES, Event
 
 sys.path.append(str(Path(__file__).parent / "pipeline"))
@@ -87,8 +88,8 @@ def test_json_is_one_object_with_what_the_summary_holds(cli: Cli, made: Survey, 
         (["--set", "ratio=0.7"], "jaxba: --set ratio=0.7: write section.name=value"),
         (["--crs", "EPSG:4326"], "jaxba: crs.target_crs=EPSG:4326, EPSG:4326 (WGS 84), is geographic"),
         (["--focal", "12"], "jaxba: metadata.focal=12.0 is out of range; allowed: 100 to 100000"),
-        (["--workers", "0"], "jaxba: workers 0: give 1 or more"),
-        (["--max-memory", "2"], "jaxba: max_memory 2: give a share"),
+        (["--workers", "0"], "jaxba: workers.workers=0 is out of range; allowed: 1 to 1024"),
+        (["--max-memory", "2"], "jaxba: workers.max_memory=2.0: give a share"),
         (["--geotags", "gone.txt"], "jaxba: gone.txt: there is no such file"),
         (["--fokal", "12"], "jaxba: Unknown option: --fokal. Did you mean --focal?"),
     ],
@@ -118,7 +119,10 @@ def test_ctrl_c_ends_with_130_and_the_next_run_goes_on(cli: Cli, photos: Path, t
     os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it, to the workers too
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert err == "jaxba: interrupted; what is done is kept, and the same command goes on from there.\n"
+    assert err.splitlines() == [
+        "metadata  begins", "crs       begins", f"features  begins, {NUM_PHOTOS} photos",
+        "jaxba: interrupted; what is done is kept, and the same command goes on from there.",
+    ]  # fmt: skip
     kept = {path: path.stat().st_ino for path in features.glob("*/record.json")}
     assert 1 <= len(kept) < NUM_PHOTOS and not list(features.glob(".*"))
     code, out, _ = cli(*arguments)
@@ -128,7 +132,7 @@ def test_ctrl_c_ends_with_130_and_the_next_run_goes_on(cli: Cli, photos: Path, t
 
 def test_a_terminal_shows_what_runs(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    show = _Progress(quiet=False)
+    show = LiveLine()
     for event in (Event("begin", "features"), Event("photo", "features", 3, 8), Event("begin", "adjust")):
         show(event)
     shown = capsys.readouterr().err

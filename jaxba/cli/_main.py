@@ -14,7 +14,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.cli._options import LossName, SolveOptions
+from jaxba.cli._options import LossName, SolveOptions, WorkerOptions
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
@@ -127,13 +127,21 @@ def run(
     require_connected: Annotated[
         bool, Parameter(negative="", show_default=False, help="Stop where the photos fall into several groups.")
     ] = False,
-    workers: Annotated[int | None, Parameter(help="Processes for features and matches. [default: one a core]")] = None,
-    max_memory: Annotated[float, Parameter(help="Share of the machine's memory for them, or bytes.")] = 0.8,
+    workers: Annotated[WorkerOptions | None, Parameter(name="*")] = None,
     json: Annotated[
         bool, Parameter(negative="", show_default=False, help="Print one JSON object on standard output.")
     ] = False,
     quiet: Annotated[
         bool, Parameter(negative="", show_default=False, help="Print no progress and no summary.")
+    ] = False,
+    log_json: Annotated[
+        bool,
+        Parameter(
+            negative="",
+            show_default=False,
+            help="Progress as JSON, one object a line on standard error: run_begin, stage_begin, progress (done, "
+            "total, eta_s), step, item_failed, stage_end; run_end, stopped or interrupted. With --quiet only these.",
+        ),
     ] = False,
 ) -> int:
     from jaxba.cli._run import run
@@ -148,10 +156,10 @@ def run(
         stage=stage,
         changes=set_,
         require_connected=require_connected,
-        workers=workers,
-        max_memory=max_memory,
+        workers=workers or WorkerOptions(),
         as_json=json,
         quiet=quiet,
+        log_json=log_json,
     )
 
 

@@ -1,4 +1,4 @@
-"""Options of `solve`, as the command line takes them; the defaults are those of `jaxba.solve`."""
+"""Options of `solve`, as the command line takes them, with the defaults of `jaxba.solve`; and those of workers."""
 
 import dataclasses
 from pathlib import Path
@@ -60,3 +60,31 @@ class SolveOptions:
     ] = False
     quiet: Annotated[bool, Parameter(negative="", show_default=False, help="Print no progress and no summary.")] = False
     verbose: Annotated[bool, Parameter(negative="", show_default=False, help="Print a line a step.")] = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorkerOptions:
+    """What `run` takes for its workers, in place of the table [workers] of its settings."""
+
+    workers: Annotated[int | None, Parameter(help="Processes for features and matches. [default: one a core]")] = None
+    max_memory: Annotated[
+        str | None,
+        Parameter(help="Memory for all of them: a share of the machine's, or an amount: 4GB, 800MB. [default: 0.8]"),
+    ] = None
+    time_limit: Annotated[
+        float | None,
+        Parameter(help="Seconds that a photo may take in a stage. [default: 60 and 10 a megapixel or pair]"),
+    ] = None
+    max_failed: Annotated[
+        float | None,
+        Parameter(help="Stop when more photos fail in a stage: a share below 1, or a number. [default: 0.5]"),
+    ] = None
+    max_store: Annotated[
+        str | None,
+        Parameter(help="What features may take on the disk: a share of what is free, or an amount. [default: 0.9]"),
+    ] = None
+
+    def changes(self) -> list[str]:
+        """Return what was given as changes of settings."""
+        given = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return [f"workers.{name}={value}" for name, value in given.items() if value is not None]

@@ -1,20 +1,24 @@
 """`jaxba run`: the pipeline with its progress, then what a surveyor wants to know of the result."""
 
+import contextlib
 import math
-import re
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxba import __version__
+from jaxba._errors import JaxbaError
 from jaxba.cli._cache import use_compilation_cache
 from jaxba.cli._config import configured
-from jaxba.cli._main import INTERRUPTED
+from jaxba.cli._main import BAD_INPUT, INTERRUPTED
+from jaxba.cli._options import WorkerOptions
+from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Progress, StageLines, steps_told
 from jaxba.cli._text import first_of, many, to_json, wrapped
-from jaxba.pipeline import Event, Resources, Run, changed, run_pipeline, stage_lines, summary
+from jaxba.pipeline import Event, Run, changed, run_pipeline, summary
 
-_CLEAR = "\r\x1b[K"
-_LABEL, _SUMMARY_LABEL = 10, 12
+_SUMMARY_LABEL = 12
 
 
 def run(
@@ -28,37 +32,57 @@ def run(
     stage: str | None,
     changes: Sequence[str],
     require_connected: bool,
-    workers: int | None,
-    max_memory: float,
+    workers: WorkerOptions,
     as_json: bool,
     quiet: bool,
+    log_json: bool,
 ) -> int:
     """Run the pipeline and say what came out; return the exit code."""
-    settings = changed(configured(config, quiet=quiet or as_json), changes)
-    for flag, given in (
-        (f"crs.target_crs={crs}", crs is not None),
-        (f"metadata.focal={focal}", focal is not None),
-        ("tracks.require_connected=true", require_connected),
-    ):
-        if given:
-            settings = changed(settings, [flag])
-    use_compilation_cache()
-    show = _Progress(quiet=quiet or as_json)
+    json_lines = JsonLines() if log_json else None
+    show: Progress | None = json_lines
+    if show is None and not (quiet or as_json):
+        show = LiveLine() if sys.stderr.isatty() else LogLines()
+    begun, current = time.monotonic(), None
+    stage_end = StageLines()
+
+    def tell(event: Event) -> None:
+        nonlocal current
+        current = event.stage
+        if show is not None:
+            show(event)
+        if not (quiet or as_json):
+            stage_end(event)
+
     try:
-        result = run_pipeline(
-            photos,
-            out,
-            settings,
-            until=stage,
-            geotags=geotags,
-            resources=Resources(workers=workers, max_memory=max_memory),
-            tell=show,
-        )
+        if json_lines is not None:
+            json_lines.say("run_begin", version=__version__, photos=str(photos), out=str(out))
+        settings = changed(configured(config, quiet=quiet or as_json or log_json), changes)
+        for flag, given in (
+            (f"crs.target_crs={crs}", crs is not None),
+            (f"metadata.focal={focal}", focal is not None),
+            ("tracks.require_connected=true", require_connected),
+        ):
+            if given:
+                settings = changed(settings, [flag])
+        settings = changed(settings, workers.changes())
+        use_compilation_cache()
+        with contextlib.nullcontext() if show is None else steps_told(show.step):
+            result = run_pipeline(photos, out, settings, until=stage, geotags=geotags, tell=tell)
     except KeyboardInterrupt:
-        print("jaxba: interrupted; what is done is kept, and the same command goes on from there.", file=sys.stderr)
+        if json_lines is not None:
+            json_lines.say("interrupted", stage=current)
+        else:
+            _clear(show)
+            print("jaxba: interrupted; what is done is kept, and the same command goes on from there.", file=sys.stderr)
         return INTERRUPTED
-    finally:
-        show.clear()
+    except JaxbaError as error:
+        _clear(show)
+        if json_lines is None:
+            raise
+        json_lines.say("stopped", stage=current, reason=str(error))
+        return BAD_INPUT
+    if json_lines is not None:
+        json_lines.say("run_end", seconds=round(time.monotonic() - begun, 3), stages_run=list(result.stages_run))
     if as_json:
         print(to_json(summary(result)))
     elif not quiet:
@@ -66,39 +90,9 @@ def run(
     return 0
 
 
-class _Progress:
-    """One line a stage as it ends; on a terminal, a line that is overwritten while a stage runs."""
-
-    def __init__(self, *, quiet: bool) -> None:
-        self.quiet, self.live = quiet, sys.stderr.isatty()
-        self.said: set[str] = set()
-
-    def __call__(self, event: Event) -> None:
-        if self.quiet:
-            return
-        if self.live and event.kind != "end":
-            count = f"{event.done} of {many(event.total, 'photo')}" if event.kind == "photo" else "..."
-            print(f"{_CLEAR}{event.stage:<{_LABEL}}{count}", end="", file=sys.stderr, flush=True)
-        if event.kind == "end":
-            self.clear()
-            if event.total:
-                first, *notes = stage_lines(event)
-                print(wrapped(event.stage, f"{first}   {event.seconds:.1f} s", _LABEL), flush=True)
-                for note in notes:
-                    if news := self._news(note):
-                        print(wrapped("", news, _LABEL), flush=True)
-
-    def clear(self) -> None:
-        """Wipe the line that is overwritten."""
-        if self.live and not self.quiet:
-            print(_CLEAR, end="", file=sys.stderr, flush=True)
-
-    def _news(self, note: str) -> str:
-        """Return the sentences of a note that this run has not said yet."""
-        sentences = re.split(r"(?<=\.) (?=[A-Z])", note)
-        news = [sentence for sentence in sentences if sentence not in self.said]
-        self.said.update(sentences)
-        return " ".join(news)
+def _clear(show: Progress | None) -> None:
+    if show is not None:
+        show.clear()
 
 
 def _print_summary(result: Run, out: Path) -> None:

@@ -11,13 +11,16 @@ from jaxba.scene import Left
 class Event:
     """What a run tells while it goes.
 
-    - `kind`: `begin` and `end` of a stage, `photo` after each photo of a stage that goes by photos.
+    - `kind`: `begin` and `end` of a stage; `todo` where it has anything to do, before it does so, with `by_photos`
+      photo by photo; `photo` after each of them.
     - `done`, `total`: photos that were worked on; `total` 0 means that nothing had to be done.
-    - `outputs`: at the end, what the stage made. `left_out`: files that no stage before left out, and this one did.
+    - `share`: of a stage's work that is done, where photos count by their megapixels and by the photos beside them.
+    - `outputs`: at the end, what the stage made. `left_out`: files that no stage before left out, and this one did;
+      after a photo, that one, where it failed. `notes`: what should be known of how the stage was done.
     - `photos`: at the end, the names of the photos by image index.
     """
 
-    kind: Literal["begin", "photo", "end"]
+    kind: Literal["begin", "todo", "photo", "end"]
     stage: str
     done: int = 0
     total: int = 0
@@ -25,6 +28,9 @@ class Event:
     outputs: Any = None
     left_out: tuple[Left, ...] = ()
     photos: tuple[str, ...] = ()
+    share: float = 0.0
+    notes: tuple[str, ...] = ()
+    by_photos: bool = False
 
 
 @dataclass(frozen=True)

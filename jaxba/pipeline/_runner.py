@@ -14,16 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline import _store
+from jaxba.pipeline import _store, features
 from jaxba.pipeline._events import Event, Run
+from jaxba.pipeline._limits import check_failures, check_store
 from jaxba.pipeline._lock import locked
 from jaxba.pipeline._parameters import Parameters
+from jaxba.pipeline._pool import Item, fewer_workers, work as work_on
 from jaxba.pipeline._project import SETTINGS, SUMMARY, Given, Project, read_geotags
 from jaxba.pipeline._settings import Settings, to_toml
 from jaxba.pipeline._stages import NAMES, STAGES, Done, Stage, run_photo
 from jaxba.pipeline._summary import left_out, stage_lines, summary
-from jaxba.pipeline._work import Work, collected, why_to_do, without_path, works
-from jaxba.pipeline._workers import Item, Resources, memory_for, work as work_on
+from jaxba.pipeline._work import Work, collected, failures, why_to_do, without_path, works
+from jaxba.pipeline._workers import Resources, memory_for
 from jaxba.scene import Left
 
 
@@ -40,6 +42,7 @@ def run_pipeline(
     """Run the pipeline on a folder of photos, up to and with the stage `until`; what is unchanged is not run again.
 
     - `out`: the project folder. `settings`: parameters by stage. `geotags`: a list that replaces the photos' tags.
+    - `resources`: of the workers, in place of the settings' own.
 
     Raises `JaxbaError` where the photos, the parameters or the folder make a result impossible, and where another run
     works on the project; the stages before it are kept.
@@ -52,7 +55,11 @@ def run_pipeline(
         given = Given(photos=photos, geotags=geotags)
         done = Done(files=project.photo_files(photos), geotags=read_geotags(photos, geotags))
         project.write_text(SETTINGS, to_toml(settings))
-        return _run_stages(project, given, done, settings, until, resources or Resources(), tell)
+        if resources is None:
+            found = settings["workers"]
+            assert isinstance(found, Resources)
+            resources = found
+        return _run_stages(project, given, done, settings, until, resources, tell)
 
 
 def _run_stages(
@@ -71,7 +78,7 @@ def _run_stages(
         project.write_given(given, stage.name)
         tell(Event("begin", stage.name))
         try:
-            outputs, total, unused = _run_stage(project, stage, done, settings[stage.name], resources, tell)
+            outputs, total, unused, notes = _run_stage(project, stage, done, settings[stage.name], resources, tell)
         except (JaxbaError, KeyboardInterrupt) as error:
             reason = str(error) or "interrupted"
             with contextlib.suppress(JaxbaError):  # what stopped the run is the news
@@ -85,7 +92,7 @@ def _run_stages(
         seconds = time.perf_counter() - begun
         names = tuple(photo.name for photo in done.photos)
         left_here = left_out(done).get(stage.name, ())
-        event = Event("end", stage.name, total, total, seconds, outputs, left_here, names)
+        event = Event("end", stage.name, total, total, seconds, outputs, left_here, names, notes=notes)
         lines[stage.name] = stage_lines(event)
         tell(event)
         if stage.name == until:
@@ -108,21 +115,26 @@ def _run_stage(
     params: Parameters,
     resources: Resources,
     tell: Callable[[Event], None],
-) -> tuple[Any, int, tuple[Left, ...]]:
-    """Return what a stage made, how much of it had to be done, and the photos that it could not work on."""
+) -> tuple[Any, int, tuple[Left, ...], tuple[str, ...]]:
+    """Return what a stage made, how much of it had to be done, the photos that it could not work on, and notes."""
     items = works(project, stage, done, params)
     waiting = [item for item in items if why_to_do(project, stage, item, params)]
+    if waiting:
+        tell(Event("todo", stage.name, 0, len(waiting), by_photos=stage.collect is not None))
     if stage.collect is None:
         for item in waiting:
             _run_whole(project, stage, item, params)
-        return collected(stage, done, items)[0], len(waiting), ()
-    died = _run_photos(stage, waiting, params, resources, tell)
-    outputs, failed = collected(stage, done, items)
-    unused = tuple(sorted((*failed, *died), key=lambda left: left.name))
+        return collected(stage, done, items)[0], len(waiting), (), ()
+    if waiting and isinstance(params, features.Params):
+        check_store(project.stage(stage.name), len(items), params, resources)
+    failed, notes = _run_photos(stage, items, waiting, params, resources, tell)
+    by_name = {left.name: left for left in (*failed, *failures(items))}
+    unused = tuple(by_name[name] for name in sorted(by_name))
+    check_failures(stage.name, unused, len(items), resources)
     if items and len(unused) == len(items):
         first = "; ".join(f"{left.name}: {left.reason}" for left in unused[:3])
         raise JaxbaError(f"stage {stage.name}: none of {len(items)} photos could be used. First: {first}")
-    return outputs, len(waiting), unused
+    return collected(stage, done, items)[0], len(waiting), unused, notes
 
 
 def _run_whole(project: Project, stage: Stage, item: Work, params: Parameters) -> None:
@@ -135,23 +147,37 @@ def _run_whole(project: Project, stage: Stage, item: Work, params: Parameters) -
 
 
 def _run_photos(
-    stage: Stage, waiting: list[Work], params: Parameters, resources: Resources, tell: Callable[[Event], None]
-) -> list[Left]:
-    """Run a stage for photos in workers; return those whose worker left nothing behind, with the reason."""
+    stage: Stage,
+    items: list[Work],
+    waiting: list[Work],
+    params: Parameters,
+    resources: Resources,
+    tell: Callable[[Event], None],
+) -> tuple[list[Left], tuple[str, ...]]:
+    """Run a stage for its photos that wait, in workers; return those that failed, with the reason, and notes."""
     if not waiting:
-        return []
-    module, died = stage.module.__name__, []
+        return [], ()
+    module, todo = stage.module.__name__, {id(work) for work in waiting}
+    before = failures([work for work in items if id(work) not in todo])
+    failed: list[Left] = []
     queue = [
         Item(
             name=str(work.photo),
             arguments=(module, work.folder, work.inputs, params, work.key),
             need_bytes=memory_for(work.megapixels),
+            effort=work.megapixels * (1 + work.partners),
         )
         for work in waiting
     ]
-    tell(Event("photo", stage.name, 0, len(queue)))
-    for count, (item, _, reason) in enumerate(work_on(run_photo, queue, resources), 1):
-        if reason is not None:
-            died.append(Left(name=item.name, reason=without_path(item.name, reason)))
-        tell(Event("photo", stage.name, count, len(queue)))
-    return died
+    effort_done, effort = 0.0, sum(item.effort for item in queue)
+    with contextlib.closing(work_on(run_photo, queue, resources)) as ending:
+        for count, (item, recorded, reason) in enumerate(ending, 1):
+            left = tuple(
+                Left(name=item.name, reason=without_path(item.name, why)) for why in (recorded or reason,) if why
+            )
+            failed += left
+            effort_done += item.effort
+            tell(Event("photo", stage.name, count, len(queue), left_out=left, share=effort_done / effort))
+            check_failures(stage.name, [*before, *failed], len(items), resources)
+    note = fewer_workers(queue, resources)
+    return failed, () if note is None else (note,)

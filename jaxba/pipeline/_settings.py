@@ -20,14 +20,15 @@ from jaxba._errors import JaxbaError
 from jaxba.pipeline._key import plain
 from jaxba.pipeline._parameters import Parameters, allowed, taken
 from jaxba.pipeline._stages import STAGES
+from jaxba.pipeline._workers import Resources
 
 Settings = Mapping[str, Parameters]
 """Parameters by section."""
 
 
 def default_settings() -> dict[str, Parameters]:
-    """Return every section's defaults: those of the stages, in their order."""
-    return {stage.name: stage.module.Params() for stage in STAGES}
+    """Return every section's defaults: those of the stages, in their order, and of their workers."""
+    return {**{stage.name: stage.module.Params() for stage in STAGES}, "workers": Resources()}
 
 
 def changed(settings: Settings, changes: Sequence[str]) -> dict[str, Parameters]:

@@ -6,6 +6,7 @@ from the contents of its inputs.
 """
 
 import dataclasses
+import errno
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,12 +58,13 @@ class Done:
 
 @dataclass(frozen=True)
 class PhotoItem:
-    """The inputs of one photo, what of them counts, by name, and the photo's size."""
+    """The inputs of one photo, what of them counts, by name, the photo's size, and how many others go with it."""
 
     name: str
     inputs: Any
     identity: dict[str, Any]
     megapixels: float
+    partners: int = 0
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ def _match(done: Done) -> list[PhotoItem]:
         if np.isfinite(inputs.reference.height_above_ground_m[0]):
             identity["photos"] = [entry.sha256 for entry in photos]
             megapixels = max(entry.megapixels for entry in photos)
-        items.append(PhotoItem(photo.name, inputs, identity, megapixels))
+        items.append(PhotoItem(photo.name, inputs, identity, megapixels, len(rows)))
     return items
 
 
@@ -237,7 +239,12 @@ def run_photo(module: str, folder: Any, inputs: Any, params: Any, key: Key) -> s
     try:
         outputs = stage.run(inputs, params)
     except JaxbaError as error:
-        save_failure(folder, str(error), key)
+        system = error.__cause__ or error.__context__
+        number = system.errno if isinstance(system, OSError) else None
+        if number == errno.ENOMEM:
+            raise MemoryError from error
+        if number is None:  # else it is not the photo's fault but the machine's, and may go well another time
+            save_failure(folder, str(error), key)
         return str(error)
     save(folder, outputs, key)
     return None

@@ -65,7 +65,7 @@ def stage_lines(event: Event) -> list[str]:
     else:
         first = _many(len(outputs.files), "file")
         notes = list(outputs.notes)
-    return [first, *notes]
+    return [first, *event.notes, *notes]
 
 
 def summary(run: Run) -> dict[str, Any]:

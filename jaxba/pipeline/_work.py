@@ -21,7 +21,7 @@ class Work:
     """The work of a stage, or of one photo of it.
 
     - `photo`: its name; None for a stage that does all photos at once. `folder`: where what it makes lies.
-    - `megapixels`: of the photo.
+    - `megapixels`: of the photo. `partners`: how many others it is worked on with.
     """
 
     photo: str | None
@@ -29,6 +29,7 @@ class Work:
     key: Key
     inputs: Any
     megapixels: float = 0.0
+    partners: int = 0
 
     @property
     def record(self) -> _store.Record | None:
@@ -53,6 +54,7 @@ def works(project: Project, stage: Stage, done: Done, params: Parameters) -> lis
             Key.of(module, params, item.identity),
             item.inputs,
             item.megapixels,
+            item.partners,
         )
         for item in stage.inputs(done)
     ]
@@ -78,17 +80,18 @@ def collected(stage: Stage, done: Done, items: Sequence[Work]) -> tuple[Any, tup
     if stage.collect is None:
         return _store.load(items[0].folder, stage.module.Outputs), ()
     index = {photo.name: i for i, photo in enumerate(done.photos)}
-    folders, digests, left = {}, {}, []
+    folders, digests = {}, {}
     for item in items:
         record, name = item.record, item.photo
-        if record is None or name is None:
-            continue
-        if record.failed is not None:
-            left.append(Left(name=name, reason=without_path(name, record.failed)))
-            continue
-        folders[index[name]], digests[index[name]] = item.folder, record.digest
-    outputs = stage.collect(done, folders, digests)
-    return outputs, tuple(left)
+        if record is not None and name is not None and record.failed is None:
+            folders[index[name]], digests[index[name]] = item.folder, record.digest
+    return stage.collect(done, folders, digests), failures(items)
+
+
+def failures(items: Sequence[Work]) -> tuple[Left, ...]:
+    """Return the photos of which it is recorded that nothing can be made, and why."""
+    reasons = {item.photo: record.failed for item in items if (record := item.record) is not None}
+    return tuple(Left(name=name, reason=without_path(name, why)) for name, why in reasons.items() if name and why)
 
 
 def without_path(name: str, reason: str) -> str:

@@ -1,50 +1,71 @@
-"""Work on many photos in processes: one that dies costs the photo that it worked on, and nothing else.
-
-Each worker uses one thread of OpenCV and of BLAS, and may not grow over its share of the memory; how many there are
-follows from the machine's cores and from what the largest photo needs.
-"""
+"""Settings of the worker processes: what they may use, how long a photo may take, how many photos may fail."""
 
 import os
-import signal
-import sys
-from collections.abc import Callable, Iterator, Sequence
+import re
 from dataclasses import dataclass
-from multiprocessing import get_context
-from typing import Any
+from pathlib import Path
 
 import psutil
-from pebble import ProcessExpired, ProcessPool
 
 from jaxba._errors import JaxbaError
+from jaxba.pipeline._parameters import Parameters, parameter
 
 _BASE_GB, _GB_PER_MEGAPIXEL = 0.35, 0.25  # SIFT holds 1.25 GB at 5 megapixels and 4.6 GB at 20
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+_BASE_S, _S_PER_EFFORT = 60.0, 10.0  # SIFT takes 0.7 s a megapixel, two photos of 8000 features 0.5 s, on an idle core
+_AMOUNT = re.compile(r"(\d+(?:\.\d*)?(?:e\d+)?)\s*([kmgt]i?)?b?", re.IGNORECASE)
+_LEAST_MEMORY, _LEAST_STORE = 1e8, 1e6
+_CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # version 2, 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resources:
-    """What the workers may use.
+class Resources(Parameters):
+    """What the workers may use."""
 
-    - `workers`: processes; None: one a core. `max_memory`: up to 1 a share of the machine's memory, above it bytes.
-    """
-
-    workers: int | None = None
-    max_memory: float = 0.8
+    workers: int | None = parameter(
+        None, low=1, high=1024, help="processes for features and matches; none: one a core; fewer where memory ends"
+    )
+    max_memory: float | str = parameter(
+        0.8, help="memory for all of them: a share of the machine's, 0.1 to 0.95, or an amount such as 4GB or 800MB"
+    )
+    time_limit: float | None = parameter(
+        None, low=1, high=86400, help="s that a photo may take in a stage; none: 60 and 10 a megapixel or pair"
+    )
+    max_failed: float = parameter(
+        0.5, low=0, high=1e9, help="the run stops when more photos fail in a stage: a share below 1, or a number"
+    )
+    max_store: float | str = parameter(
+        0.9, help="what features may take on the disk: a share of what is free, 0.1 to 1, or an amount such as 500GB"
+    )
 
     def __post_init__(self) -> None:
-        if self.workers is not None and self.workers < 1:
-            raise JaxbaError(f"workers {self.workers}: give 1 or more.")
-        if not (0.1 <= self.max_memory <= 0.95 or self.max_memory >= 1e8):
-            raise JaxbaError(f"max_memory {self.max_memory:g}: give a share from 0.1 to 0.95, or bytes (1e8 or more).")
+        Parameters.__post_init__(self)
+        _check_amount("max_memory", self.max_memory, most_share=0.95, least_bytes=_LEAST_MEMORY)
+        _check_amount("max_store", self.max_store, most_share=1.0, least_bytes=_LEAST_STORE)
+        if self.max_failed > 1 and not float(self.max_failed).is_integer():
+            raise JaxbaError(f"workers.max_failed={self.max_failed:g}: give a share below 1, or a whole number.")
 
     @property
     def memory_bytes(self) -> float:
-        return self.max_memory * psutil.virtual_memory().total if self.max_memory < 1 else self.max_memory
+        """What all workers together may take."""
+        return bytes_of(self.max_memory, machine_memory())
+
+    def num_wanted(self) -> int:
+        """Return how many workers are asked for: that many, or one a core."""
+        if self.workers is not None:
+            return self.workers
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
     def num_workers(self, need_bytes: float) -> int:
         """Return how many processes fit that need this much each; at least one."""
-        wanted = self.workers or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        return max(1, min(wanted or 1, int(self.memory_bytes / need_bytes)))
+        return max(1, min(self.num_wanted(), int(self.memory_bytes / need_bytes)))
+
+    def seconds_for(self, effort: float) -> float:
+        """Return how long an item may take; `effort`: its megapixels, times the photos it is worked on with."""
+        return _BASE_S + _S_PER_EFFORT * effort if self.time_limit is None else float(self.time_limit)
+
+    def num_may_fail(self, total: int) -> int:
+        """Return how many of so many photos may fail."""
+        return int(self.max_failed * total if self.max_failed < 1 else self.max_failed)
 
 
 def memory_for(megapixels: float) -> float:
@@ -52,90 +73,35 @@ def memory_for(megapixels: float) -> float:
     return (_BASE_GB + _GB_PER_MEGAPIXEL * megapixels) * 1e9
 
 
-@dataclass(frozen=True, kw_only=True)
-class Item:
-    """One photo's work: `call(*arguments)` in a worker. `name`: the photo's. `need_bytes`: the memory it takes."""
+def machine_memory() -> float:
+    """Return the bytes of memory that the machine has, or the container that this runs in."""
+    total = float(psutil.virtual_memory().total)
+    for path in map(Path, _CONTAINER_LIMITS):
+        text = path.read_text().strip() if path.is_file() else ""
+        total = min(total, float(text)) if text.isdigit() else total  # `max`: no limit
+    return total
 
-    name: str
-    arguments: tuple[Any, ...]
-    need_bytes: float
 
+def bytes_of(amount: float | str, whole: float) -> float:
+    """Return the bytes that `0.8` (a share of the whole), `4e9`, `4GB`, `800 MB` or `2GiB` mean; nan for other texts.
 
-def work(
-    call: Callable[..., Any], items: Sequence[Item], resources: Resources
-) -> Iterator[tuple[Item, Any, str | None]]:
-    """Yield each item with its result, or with the reason why it has none, as they come to an end.
-
-    `call` must be a module's function. A `JaxbaError` in it is raised here: it stops the run.
+    >>> bytes_of("0.5", 16e9), bytes_of("4GB", 16e9), bytes_of("1KiB", 16e9)
+    (8000000000.0, 4000000000.0, 1024.0)
     """
-    limit = resources.memory_bytes
-    fitting = [item for item in items if item.need_bytes <= limit]
-    for item in items:
-        if item.need_bytes > limit:
-            need, allowed = item.need_bytes / 1e9, limit / 1e9
-            yield item, None, f"needs about {need:.1f} GB of memory, {allowed:.1f} GB are allowed; raise --max-memory"
-    if not fitting:
-        return
-    largest = max(item.need_bytes for item in fitting)
-    count = min(resources.num_workers(largest), len(fitting))
-    pool = ProcessPool(
-        max_workers=count,
-        context=get_context("spawn"),
-        initializer=_prepare_worker,
-        initargs=(int(max(limit / count, largest)),),
-    )
-    with _one_thread_each():  # a worker may start at any time
-        try:
-            futures = [pool.schedule(call, args=item.arguments) for item in fitting]
-            for item, future in zip(fitting, futures, strict=True):
-                yield item, *_outcome(future)
-            pool.close()
-        except BaseException:
-            pool.stop()
-            raise
-        finally:
-            pool.join()
+    found = _AMOUNT.fullmatch(str(amount).strip())
+    if found is None:
+        return float("nan")
+    number, unit = float(found[1]), (found[2] or "").lower()
+    if not unit:
+        return number * whole if number <= 1 else number
+    base = 1024 if unit.endswith("i") else 1000
+    return number * base ** ("kmgt".index(unit[0]) + 1)
 
 
-def _outcome(future: Any) -> tuple[Any, str | None]:
-    try:
-        return future.result(), None
-    except JaxbaError:
-        raise
-    except ProcessExpired as error:
-        code = error.exitcode
-        how = f"exit code {code}" if code is None or code >= 0 else f"killed by {signal.Signals(-code).name}"
-        return None, f"its worker process died ({how}): out of memory, or a broken file that crashes the decoder"
-    except MemoryError:
-        return None, "not enough memory; raise --max-memory or use fewer --workers"
-    except Exception as error:  # whatever a decoder makes of a broken file, it costs that file alone
-        return None, f"{type(error).__name__}: {error}"
-
-
-class _one_thread_each:
-    """The environment that makes a new process's BLAS use one thread."""
-
-    def __enter__(self) -> None:
-        self.before = {name: os.environ.get(name) for name in _ONE_THREAD}
-        os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-
-    def __exit__(self, *_: object) -> None:
-        for name, value in self.before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _prepare_worker(limit_bytes: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    if sys.platform == "linux":
-        import resource
-
-        # address space beyond what is in use: libraries map far more than they touch
-        mapped = psutil.Process().memory_info().vms
-        most = mapped + limit_bytes + int(1e9)
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    import cv2
-
-    cv2.setNumThreads(1)
+def _check_amount(name: str, amount: float | str, *, most_share: float, least_bytes: float) -> None:
+    share = bytes_of(amount, 1.0)
+    if not (0.1 <= share <= most_share or share >= least_bytes):
+        least = f"{least_bytes / 1e6:g}MB"
+        raise JaxbaError(
+            f"workers.{name}={amount}: give a share from 0.1 to {most_share:g}, or an amount from {least} such as 4GB."
+        )

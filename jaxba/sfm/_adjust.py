@@ -12,6 +12,7 @@ Convergence is judged by the median of the errors: it changes by less than 1%.
 """
 
 import dataclasses
+import logging
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -28,6 +29,8 @@ from jaxba.sfm._judge import estimate_std, judge, used_in_track
 from jaxba.sfm._points import apply_points, track_rows, triangulate_tracks
 from jaxba.sfm._problem import free_parameters, to_problem, used_positions, with_solution
 from jaxba.sfm._settings import Settings
+
+_log = logging.getLogger(__name__)
 
 _SPARE = 0.03  # room for tracks that pruning cuts in two
 _START_ERROR = 0.005  # of the longer side: what start values are good to
@@ -110,6 +113,7 @@ def adjust(
         solved = rounds.solve(block, std_px, free, shape, max_nfev=min(steps, settings.max_nfev))
         block = solved.block
         medians.append(float(np.median(solved.error_px)))
+        _log.info("round %d, median %.2f px", len(medians), medians[-1])
         settled = len(medians) > 2 and abs(medians[-1] - medians[-2]) <= _CONVERGED * medians[-2]
         converged = settled and solved.solution.converged
         if converged or last:

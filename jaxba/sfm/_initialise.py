@@ -12,6 +12,7 @@ no start value depends on one of them being right.
 """
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -29,6 +30,8 @@ from jaxba.sfm._register import CONTRADICTION, contradictions, drop_weak, regist
 from jaxba.sfm._rotations import average_rotations
 from jaxba.sfm._rough import adjust_roughly
 from jaxba.sfm._start_cameras import StartCameras, used_cameras
+
+_log = logging.getLogger(__name__)
 
 _MAX_EDGE_ERROR = np.deg2rad(6.0)  # the wrong one of a plane's two poses is off by 10 degrees and more
 _RAY_SCALE = 0.01  # radians: an uncalibrated lens's distortion, seen by rays half way out
@@ -64,16 +67,20 @@ def initialise(
     notes: list[str] = []
     cameras = StartCameras.of(photos, component, camera_model)
     notes += cameras.notes
+    _log.info("rotations of %d images", len(component))
     start = _rotations(photos, view_graph, component, notes)
     block = cameras.block(start.image_index, start.quaternion)
+    _log.info("positions of %d images", block.num_images)
     chosen, block = _positions(block, tracks, photos, min_angle_rad)
     block = _place(block, reference, notes)
     focal_std = cameras.focal_std
     longer = float(max(max(p.width_px, p.height_px) for p in photos))
     for share in (_COARSE, _FINE):
+        _log.info("rough adjustment of %d images", block.num_images)
         block = with_points(block, chosen, min_angle_rad=min_angle_rad, max_error_px=share * longer)
         block = drop_weak(block, chosen, reference, start.reasons, min_angle_rad, share * longer, np.inf)
         block = _adjust(block, reference, focal_std)
+    _log.info("points of all tracks")
     block = with_points(block, tracks, min_angle_rad=min_angle_rad, max_error_px=_FINE * longer)
     reasons = dict(start.reasons)
     block = register_more(block, tracks, cameras, component, reasons, min_angle_rad, _FINE * longer)

@@ -3,10 +3,18 @@
 import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 
 from jaxba import JaxbaError
+
+
+class Awkward(Exception):
+    """An exception that does not survive the way to another process."""
+
+    def __init__(self, *, what: str) -> None:
+        super().__init__(what)
 
 
 def double(number: int) -> int:
@@ -20,7 +28,38 @@ def double(number: int) -> int:
         raise JaxbaError("disk full")
     if number == 17:
         np.ones(int(3e9), np.uint8)
+    if number == 18:
+        raise Awkward(what="odd")
+    if number == 19:
+        raise SystemExit(4)
+    if number == 20:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if number == 21:
+        time.sleep(600)
     return 2 * number
+
+
+def killed_once(marks: Path, number: int) -> int:
+    """Double a number; die the first time that it is tried."""
+    mark = marks / str(number)
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 2 * number
+
+
+def double_slowly(marks: Path, number: int) -> int:
+    """Double a number in 50 ms; leave a mark of who does it."""
+    (marks / str(os.getpid())).touch()
+    time.sleep(0.05)
+    return 2 * number
+
+
+def hold(size: int) -> int:
+    """Take memory for a moment."""
+    held = np.empty(size, np.uint8)
+    time.sleep(0.2)
+    return len(held)
 
 
 def threads(_: int) -> dict[str, object]:

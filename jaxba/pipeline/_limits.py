@@ -1,0 +1,73 @@
+"""Limits that stop a run before it wastes hours: features that would not fit on the disk, too many photos that fail."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxba._errors import JaxbaError
+from jaxba.pipeline._workers import Resources, bytes_of
+from jaxba.pipeline.features import Params
+from jaxba.scene import Left
+
+_OTHER_BYTES = 35  # of a keypoint: position, size and angle in float64, colour
+_DESCRIPTOR_BYTES = {"orb": 32, "akaze": 61}
+_SIFT_BYTES, _SIFT_ORIENTATIONS = 128, 1.3  # up to 1.25 were measured at 2000 keypoints a photo
+_PHOTO_BYTES = 6000  # record and headers
+_SHOWN = 3
+
+
+def store_bytes(num_photos: int, params: Params) -> float:
+    """Return the bytes that the features of so many photos take on the disk at most."""
+    if params.detector in _DESCRIPTOR_BYTES:
+        keypoint = _DESCRIPTOR_BYTES[params.detector] + _OTHER_BYTES
+    else:
+        keypoint = (_SIFT_BYTES + _OTHER_BYTES) * _SIFT_ORIENTATIONS
+    return num_photos * (params.nfeatures * keypoint + _PHOTO_BYTES)
+
+
+def check_store(store: Path, num_photos: int, params: Params, resources: Resources) -> None:
+    """Raise `JaxbaError` where the features of so many photos may not fit, or may take more than is allowed.
+
+    `store`: the folder where they are to lie. What lies there already is theirs, or is replaced: it counts as free.
+    """
+    need = store_bytes(num_photos, params)
+    place = next(folder for folder in (store, *store.absolute().parents) if folder.exists())
+    free = shutil.disk_usage(place).free
+    used = sum(path.stat().st_size for path in store.rglob("*") if path.is_file())
+    allowed = bytes_of(resources.max_store, float(free + used))
+    if need > allowed:
+        raise JaxbaError(
+            f"the features of {num_photos:,} photos take up to {_size(need)} on the disk, at {params.nfeatures:,} "
+            f"keypoints a photo; --max-store {resources.max_store} allows {_size(allowed)}, {_size(free)} are free. "
+            "Set fewer features.nfeatures, take fewer photos, raise --max-store, or choose an --out on a larger disk."
+        )
+
+
+def check_failures(stage: str, failed: Sequence[Left], total: int, resources: Resources) -> None:
+    """Raise `JaxbaError` where more of a stage's photos failed than may."""
+    if len(failed) <= resources.num_may_fail(total):
+        return
+    raise JaxbaError(
+        f"stage {stage}: {len(failed)} of {total} photos failed, and --max-failed {resources.max_failed:g} allows "
+        f"{resources.num_may_fail(total)}: {_reasons(failed)}. What is done is kept; see to these photos and run "
+        "again, or raise --max-failed."
+    )
+
+
+def _reasons(failed: Sequence[Left]) -> str:
+    """Return the commonest reasons, each with the photos that it concerns."""
+    names: dict[str, list[str]] = {}
+    for left in failed:
+        names.setdefault(left.reason.removesuffix("."), []).append(left.name)
+    commonest = sorted(names.items(), key=lambda entry: -len(entry[1]))
+    texts = [
+        ", ".join(found[:_SHOWN]) + (f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else "") + f": {reason}"
+        for reason, found in commonest[:_SHOWN]
+    ]
+    rest = len(commonest) - _SHOWN
+    return "; ".join(texts) + (f"; and {rest} other reasons" if rest > 0 else "")
+
+
+def _size(count: float) -> str:
+    unit, name = next(((u, n) for u, n in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if count >= u), (1e3, "kB"))
+    return f"{count / unit:.1f} {name}"

@@ -20,9 +20,14 @@ def parameter(
     low: float | int | None = None,
     high: float | int | None = None,
     choices: tuple[str, ...] = (),
+    several: bool = False,
 ) -> Any:
-    """Return a dataclass field with this default, range (both ends allowed) or choices, and meaning."""
-    return dataclasses.field(default=default, metadata={"help": help, "low": low, "high": high, "choices": choices})
+    """Return a dataclass field with this default, range (both ends allowed) or choices, and meaning.
+
+    `several`: a text may name several of the choices, with commas between them.
+    """
+    metadata = {"help": help, "low": low, "high": high, "choices": choices, "several": several}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,7 +43,7 @@ def allowed(field: dataclasses.Field) -> str:
     """Return what a parameter may be, in words: `0.6 to 0.85`, `auto, sift, orb`, ``."""
     low, high, choices = (field.metadata.get(key) for key in ("low", "high", "choices"))
     if choices:
-        return ", ".join(choices)
+        return ", ".join(choices) + (", or several of them with commas between" if field.metadata["several"] else "")
     if low is not None and high is not None:
         return f"{low:g} to {high:g}"
     if low is not None:
@@ -92,7 +97,8 @@ def _check(cls: type[Parameters], field: dataclasses.Field, value: Any) -> None:
         raise JaxbaError(f"{label}: give {_kind_text(kinds, optional)}.")
     low, high, choices = (field.metadata.get(key) for key in ("low", "high", "choices"))
     outside = (low is not None and not value >= low) or (high is not None and not value <= high)
-    if outside or (choices and value not in choices):
+    named = [entry.strip() for entry in str(value).split(",")] if field.metadata["several"] else [value]
+    if outside or (choices and not set(named) <= set(choices)):
         raise JaxbaError(f"{label} is out of range; allowed: {allowed(field)} ({field.metadata['help']}).")
 
 

@@ -53,7 +53,7 @@ def run_pipeline(
     with locked(project.folder):
         project.remove_leftovers()
         given = Given(photos=photos, geotags=geotags)
-        done = Done(files=project.photo_files(photos), geotags=read_geotags(photos, geotags))
+        done = Done(files=project.photo_files(photos), settings=settings, geotags=read_geotags(photos, geotags))
         project.write_text(SETTINGS, to_toml(settings))
         if resources is None:
             found = settings["workers"]

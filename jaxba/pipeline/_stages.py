@@ -8,7 +8,7 @@ from the contents of its inputs.
 import dataclasses
 import errno
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -16,23 +16,26 @@ from typing import Any
 import numpy as np
 
 from jaxba.pipeline import adjust, crs, export, features, match, metadata, pairs, start, tracks
+from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
 from jaxba.pipeline._key import Key
-from jaxba.pipeline._store import Stored, load
+from jaxba.pipeline._routing import Routing, route
+from jaxba.pipeline._store import load
 from jaxba.scene import Left, PhotoFile, Reference, ViewGraph
 
 
 @dataclass
 class Done:
-    """What the stages so far have made; None where a stage has not run."""
+    """What the stages so far have made; None where a stage has not run. `settings`: parameters by stage."""
 
     files: tuple[PhotoFile, ...]
+    settings: Mapping[str, Any]
     geotags: tuple[str, str] | None = None
     metadata: Any = None
     crs: Any = None
+    pairs: Any = None
     features: Any = None
     features_left_out: tuple[Left, ...] = ()
-    pairs: Any = None
     match: Any = None
     match_left_out: tuple[Left, ...] = ()
     tracks: Any = None
@@ -54,6 +57,20 @@ class Done:
             frame, crs="", epsg=None, crs_name="", unit="", height_note="", height_datum="", height_unit=""
         )
         return dataclasses.replace(self.crs.reference, frame=frame, review=(), notes=())
+
+    @property
+    def routing(self) -> Routing:
+        """The detector of the block, and the figures behind it."""
+        params, found = self.settings["features"], self.pairs
+        return route(
+            self.photos,
+            self.crs.reference,
+            found.pairs,
+            found.overlap,
+            detector=params.detector,
+            sift_gsd_m=params.sift_gsd,
+            sift_overlap=params.sift_overlap,
+        )
 
 
 @dataclass(frozen=True)
@@ -94,24 +111,36 @@ def _crs(done: Done) -> crs.Inputs:
     return crs.Inputs(photos=done.photos)
 
 
-def _features(done: Done) -> list[PhotoItem]:
-    return [
-        PhotoItem(photo.name, features.Inputs(photo=photo), {"photo": (photo.sha256, photo.width_px)}, photo.megapixels)
-        for photo in done.photos
-    ]
-
-
-def _features_collected(done: Done, folders: dict[int, Any], digests: dict[int, str]) -> Stored:
-    return Stored(features.Outputs, "features", folders, digests)
-
-
-def _without_keypoints(done: Done, found: Stored) -> tuple[Left, ...]:
-    empty = {index: features for index in sorted(found) if (features := found[index]).num_keypoints == 0}
-    return tuple(Left(name=done.photos[i].name, reason="; ".join(f.notes) + ".") for i, f in empty.items())
-
-
 def _pairs(done: Done) -> pairs.Inputs:
     return pairs.Inputs(photos=done.photos, reference=done.placed)
+
+
+def _features(done: Done) -> list[PhotoItem]:
+    """Each photo with what was decided for the block; the figures behind it may change as long as it stays."""
+    routing = done.routing
+    items = []
+    for photo in done.photos:
+        inputs = features.Inputs(
+            photo=photo,
+            detector=routing.detector,
+            is_height_varying=routing.is_height_varying and routing.detector == "orb",  # nothing to others
+        )
+        identity = {
+            "photo": (photo.sha256, photo.width_px),
+            "detector": inputs.detector,
+            "varying height": inputs.is_height_varying,
+        }
+        items.append(PhotoItem(photo.name, inputs, identity, photo.megapixels))
+    return items
+
+
+def _features_collected(done: Done, folders: dict[int, Any], digests: dict[int, str]) -> Detected:
+    return Detected(folders, digests, done.routing)
+
+
+def _without_keypoints(done: Done, found: Detected) -> tuple[Left, ...]:
+    empty = {index: features for index in sorted(found) if (features := found[index]).num_keypoints == 0}
+    return tuple(Left(name=done.photos[i].name, reason="; ".join(f.notes) + ".") for i, f in empty.items())
 
 
 def _partners(done: Done, image: int) -> np.ndarray:
@@ -219,8 +248,8 @@ def _export(done: Done) -> export.Inputs:
 STAGES = (
     Stage(metadata, _metadata),
     Stage(crs, _crs),
-    Stage(features, _features, _features_collected, _without_keypoints),
     Stage(pairs, _pairs),
+    Stage(features, _features, _features_collected, _without_keypoints),
     Stage(match, _match, _match_collected),
     Stage(tracks, _tracks),
     Stage(start, _start),

@@ -71,7 +71,7 @@ def status(folder: Path, settings: Settings) -> Status:
     stages: list[Standing] = []
     try:
         files = project.photo_files(given.photos, remember=False)
-        done = Done(files=files, geotags=read_geotags(given.photos, given.geotags))
+        done = Done(files=files, settings=settings, geotags=read_geotags(given.photos, given.geotags))
     except JaxbaError as error:
         stages.append(Standing(stage=STAGES[0].name, state="stale", num_all=1, reason=str(error)))
     for stage in STAGES[len(stages) :]:

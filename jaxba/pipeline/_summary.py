@@ -3,10 +3,12 @@
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._stages import Done
 from jaxba.scene import EdgeStatus, Left, ViewGraph
@@ -33,9 +35,10 @@ def stage_lines(event: Event) -> list[str]:
         found = {index: outputs[index] for index in sorted(outputs)}
         counts = [features.num_keypoints for features in found.values()]
         first = f"{sum(counts):,} keypoints, median {int(np.median(counts)):,} an image" if counts else "no keypoints"
-        used = [(event.photos[i], features.notes) for i, features in found.items() if features.num_keypoints]
-        odd = [Left(name=name, reason=note) for name, texts in used for note in texts]
-        notes = [*_grouped(event.left_out), *_grouped(_with_ranges(odd))]
+        used = [i for i, features in found.items() if features.num_keypoints]
+        texts = [(i, text) for i in used for text in (*outputs.tunings[i].reasons, *found[i].notes)]
+        odd = [Left(name=event.photos[i], reason=text) for i, text in texts]
+        notes = [*outputs.routing.reasons, *_grouped(event.left_out), *_grouped(_with_ranges(odd))]
     elif event.stage == "pairs":
         share = f" ({len(outputs.pairs) / outputs.num_all:.0%})" if outputs.num_all else ""
         first = f"{len(outputs.pairs):,} of {outputs.num_all:,} pairs{share}, {outputs.method}"
@@ -91,6 +94,8 @@ def summary(run: Run) -> dict[str, Any]:
         }
     if done.pairs is not None:
         facts["pairs"] = {"candidates": len(done.pairs.pairs), "all": done.pairs.num_all, "method": done.pairs.method}
+    if done.features is not None:
+        facts["features"] = _features(done.features, names)
     if done.tracks is not None and len(done.tracks.tracks.components) > 1:
         facts["groups"] = [[names[image] for image in group] for group in done.tracks.tracks.components]
     if done.adjust is not None:
@@ -124,6 +129,12 @@ def summary(run: Run) -> dict[str, Any]:
         for entry in entries
     ]
     return _finite(facts)
+
+
+def _features(found: Detected, names: Sequence[str]) -> dict[str, Any]:
+    """Return the decision on the detector with its figures, and how each photo was looked at, with those of its own."""
+    routing = asdict(found.routing)
+    return {"routing": routing, "photos": {names[i]: asdict(found.tunings[i]) for i in sorted(found)}}
 
 
 def left_out(done: Done) -> dict[str, tuple[Left, ...]]:
@@ -186,6 +197,6 @@ def _finite(value: Any) -> Any:
     """Return plain values in which None stands for numbers that are not finite, which JSON lacks."""
     if isinstance(value, dict):
         return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

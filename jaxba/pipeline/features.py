@@ -4,40 +4,77 @@ from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.pipeline._tuning import CONDITIONS, Tuning, tune
 from jaxba.scene import Features, Photo
-from jaxba.vision import decode, detect_features
+from jaxba.vision import OrbOptions, Pixels, decode, detect_features, measure_image
+
+_CONTRAST_FLOOR = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """- `photo`: one usable frame."""
+    """- `photo`: one usable frame.
+    - `detector`: of the whole block, for `auto`. `is_height_varying`: the block shows the ground at several scales.
+    """
 
     photo: Photo
+    detector: str = "sift"
+    is_height_varying: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Params(Parameters):
     """What the user may set."""
 
-    detector: str = parameter("sift", choices=("sift", "orb", "akaze"), help="kind of features")
-    nfeatures: int = parameter(8000, low=2000, high=20000, help="the most keypoints an image")
+    detector: str = parameter(
+        "auto",
+        choices=("auto", "sift", "orb", "akaze"),
+        help="kind of features, of all photos; auto: SIFT over sift_gsd, under sift_overlap or where these are "
+        "unknown, else ORB",
+    )
+    sift_gsd: float = parameter(0.05, low=0.005, high=1, help="m/px; auto takes SIFT over this ground sample distance")
+    sift_overlap: float = parameter(
+        0.70, low=0.3, high=0.95, help="auto takes SIFT where photos overlap the nearest by less (median)"
+    )
+    condition: str = parameter(
+        "auto",
+        choices=("auto", "none", *CONDITIONS),
+        several=True,
+        help="what thresholds that are not set follow; auto measures each photo; several by commas",
+    )
+    nfeatures: int | None = parameter(
+        None, low=2000, high=20000, help="the most keypoints an image; none: 8000 SIFT and AKAZE, 10000 ORB"
+    )
     contrast_threshold: float | None = parameter(
         None,
         low=0.02,
         high=0.08,
-        help="SIFT: weaker extrema are dropped; none: 0.04, 0.03 in low light, 0.02 where these are too few",
+        help="SIFT: weaker extrema are dropped; none: 0.04, 0.03 in low light or over water, and where fewer than "
+        "nfeatures reach it, 0.02",
     )
-    edge_threshold: float = parameter(10.0, low=5, high=20, help="SIFT: 15 over crop rows, solar arrays, roof tiles")
+    edge_threshold: float | None = parameter(
+        None, low=5, high=20, help="SIFT: extrema on edges over it are dropped; none: 10, 15 over rows and roofs"
+    )
     sigma: float = parameter(1.6, low=1.0, high=2.5, help="SIFT: blur of the first octave, px")
-    fast_threshold: int = parameter(20, low=5, high=50, help="ORB: 15 over water and flat ground")
-    nlevels: int = parameter(8, low=4, high=12, help="ORB: 10 at varying height or oblique")
+    fast_threshold: int | None = parameter(
+        None, low=5, high=50, help="ORB: grey levels that make a corner; none: 20, 15 over water and flat ground"
+    )
+    nlevels: int | None = parameter(
+        None, low=4, high=12, help="ORB: levels of the pyramid; none: 8, 10 at varying height or oblique"
+    )
+    scale_factor: float = parameter(1.2, low=1.05, high=2, help="ORB: between levels of the pyramid")
+    orb_edge: int = parameter(31, low=5, high=63, help="ORB: border without keypoints, px of each level")
+    orb_patch: int = parameter(31, low=15, high=63, help="ORB: side of what a keypoint describes, px of each level")
+    orb_score: str = parameter("harris", choices=("harris", "fast"), help="ORB: by which the strongest are kept")
+    wta_k: int = parameter(2, low=2, high=4, help="ORB: pixels compared at a time; 3 and 4 double the descriptors")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """- `features`: of the photo."""
+    """- `features`: of the photo. `tuning`: how it was looked at, and why."""
 
     features: Features
+    tuning: Tuning
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
@@ -53,14 +90,43 @@ def run(inputs: Inputs, params: Params) -> Outputs:
             f"{photo.name} has {width} x {height} pixels, and had {photo.width_px} x {photo.height_px} before; "
             "the file was changed meanwhile: run again from the metadata stage."
         )
-    features = detect_features(
-        pixels,
-        detector=params.detector,
+    conditions = tuple(condition.strip() for condition in params.condition.split(","))
+    if inputs.is_height_varying and "auto" in conditions:
+        conditions = (*conditions, "varying_height")
+    tuning = tune(
+        inputs.detector if params.detector == "auto" else params.detector,
+        conditions,
+        measure_image(pixels.gray) if "auto" in conditions else None,
         nfeatures=params.nfeatures,
         contrast_threshold=params.contrast_threshold,
         edge_threshold=params.edge_threshold,
-        sigma=params.sigma,
         fast_threshold=params.fast_threshold,
         nlevels=params.nlevels,
     )
-    return Outputs(features=features)
+    return Outputs(features=_detect(pixels, tuning, params), tuning=tuning)
+
+
+def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:
+    if tuning.detector == "sift":
+        assert tuning.contrast_threshold is not None and tuning.edge_threshold is not None
+        return detect_features(
+            pixels,
+            nfeatures=tuning.nfeatures,
+            contrast_threshold=tuning.contrast_threshold,
+            contrast_floor=_CONTRAST_FLOOR if params.contrast_threshold is None else params.contrast_threshold,
+            edge_threshold=tuning.edge_threshold,
+            sigma=params.sigma,
+        )
+    if tuning.detector == "akaze":
+        return detect_features(pixels, detector="akaze", nfeatures=tuning.nfeatures)
+    assert tuning.fast_threshold is not None and tuning.nlevels is not None
+    options = OrbOptions(
+        fast_threshold=tuning.fast_threshold,
+        nlevels=tuning.nlevels,
+        scale_factor=params.scale_factor,
+        edge_px=params.orb_edge,
+        patch_px=params.orb_patch,
+        wta_k=params.wta_k,
+        score=params.orb_score,
+    )
+    return detect_features(pixels, detector="orb", nfeatures=tuning.nfeatures, orb=options)

@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxba.pipeline import _stages, match, metadata, pairs, tracks
+from jaxba.pipeline import _stages, default_settings, match, metadata, pairs, tracks
 from jaxba.pipeline._fallback import WithFallback, detect_fallback
 from jaxba.pipeline._fingerprint import fingerprint
+from jaxba.pipeline._key import Key
 from jaxba.pipeline._store import save
 from jaxba.scene import Block, EdgeStatus, Features, Photo, Reference, Tracks
 from jaxba.sfm._complete import complete_tracks
@@ -129,7 +130,7 @@ def test_tracks_have_the_pixels_of_the_sift_keypoints(
 def test_items_of_photos_are_merged_by_image_of_the_survey(
     photos: tuple[Photo, ...], orb: dict[int, Features], tmp_path: Path
 ) -> None:
-    done = _stages.Done(files=())
+    done = _stages.Done(files=(), settings=default_settings())
     done.metadata = metadata.Outputs(photos=photos, left_out=())
     done.features = orb
     done.pairs = pairs.Outputs(
@@ -137,7 +138,7 @@ def test_items_of_photos_are_merged_by_image_of_the_survey(
     )
     for image in (0, 1):
         own = {row: orb[image + row] for row in (0, 1)}
-        save(tmp_path / str(image), run(photos[image : image + 2], own, COARSE_M), "")
+        save(tmp_path / str(image), run(photos[image : image + 2], own, COARSE_M), Key("", {}, {}))
     merged = _stages._match_collected(done, {i: tmp_path / str(i) for i in (0, 1)}, {0: "a", 1: "b"})
     assert [entry.image for entry in merged.fallback] == [0, 1, 2] and merged.num_fallback == 2
     for entry, photo in zip(merged.fallback, photos, strict=True):

@@ -1,4 +1,5 @@
 import dataclasses
+from typing import get_args, get_type_hints
 
 import pytest
 
@@ -15,7 +16,7 @@ def test_every_parameter_has_a_meaning_and_a_default_in_its_range(stage, field):
     assert len(field.metadata["help"]) > 10
     assert field.default is not dataclasses.MISSING
     low, high = field.metadata["low"], field.metadata["high"]
-    kind = int if type(field.default) is int else float
+    kind = int if int in (*get_args(get_type_hints(stage.module.Params)[field.name]), type(field.default)) else float
     for outside in [kind(bound + step) for bound, step in ((low, -1), (high, 1)) if bound is not None]:
         with pytest.raises(JaxbaError, match=f"{stage.name}.{field.name}=.* is out of range; allowed: "):
             stage.module.Params(**{field.name: outside})
@@ -43,7 +44,11 @@ def test_a_change_changes_that_parameter_alone(text, value):
         ("match.ratio=nan", "out of range"),
         ("match.ratio=high", "match.ratio=high: give a number"),
         ("match.min_inliers=12.5", "give a whole number"),
-        ("features.detector=surf", "allowed: sift, orb, akaze"),
+        ("features.detector=surf", "allowed: auto, sift, orb, akaze"),
+        (
+            "features.condition=rows,snow",
+            "low_light, rows, .* or several of them with commas between",
+        ),
         ("tracks.require_connected=maybe", "give true or false"),
     ],
 )

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from jaxba import JaxbaError
 from jaxba.scene import Features
-from jaxba.vision import Pixels, detect_features, grid_coverage
+from jaxba.vision import OrbOptions, Pixels, detect_features, grid_coverage
 
 
 def pixels_of(gray: np.ndarray) -> Pixels:
@@ -74,7 +74,7 @@ def test_frame_without_texture_has_zero_features_and_says_so(detector: str, leng
 
 def test_descriptors_are_opencvs_without_loss() -> None:
     gray = texture()
-    features = detect_features(pixels_of(gray), contrast_threshold=0.04)
+    features = detect_features(pixels_of(gray), contrast_threshold=0.04, contrast_floor=0.04)
     sift = cv2.SIFT.create(nfeatures=8000, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(gray, None)  # pyright: ignore
     assert len(keypoints) == features.num_keypoints > 500
@@ -91,13 +91,20 @@ def positions(features: Features) -> int:
 
 def test_the_largest_keypoints_are_kept_with_all_their_orientations() -> None:
     pixels = pixels_of(texture(450, 600))
-    many = detect_features(pixels, contrast_threshold=0.03)
-    few = detect_features(pixels, contrast_threshold=0.03, nfeatures=2000)
+    many = detect_features(pixels, contrast_threshold=0.03, contrast_floor=0.03)
+    few = detect_features(pixels, contrast_threshold=0.03, contrast_floor=0.03, nfeatures=2000)
     assert positions(many) > 2500 and positions(few) == 2000
     assert np.all(np.diff(many.size_px) <= 0)
     assert np.array_equal(many.xy_px[: few.num_keypoints], few.xy_px)
     rest = many.xy_px[few.num_keypoints :]
     assert not (set(map(tuple, rest)) & set(map(tuple, few.xy_px)))
+
+
+def test_more_edges_pass_a_larger_edge_threshold() -> None:
+    ridges = np.hypot(*np.gradient(cv2.GaussianBlur(texture().astype(float), (0, 0), 3)))
+    pixels = pixels_of(np.clip(40 * ridges, 0, 255).astype(np.uint8))
+    counts = [positions(detect_features(pixels, edge_threshold=edge)) for edge in (5.0, 10.0, 15.0, 20.0)]
+    assert counts == sorted(set(counts))
 
 
 def test_detection_is_deterministic() -> None:
@@ -107,23 +114,41 @@ def test_detection_is_deterministic() -> None:
             assert np.array_equal(getattr(one, field.name), getattr(two, field.name))
 
 
-def test_low_light_lowers_the_contrast_threshold() -> None:
-    dark = pixels_of(texture(450, 600, contrast=0.35, mean=60))
-    at = {c: positions(detect_features(dark, nfeatures=3000, contrast_threshold=c)) for c in (0.03, 0.04)}
-    enough = at[0.03]
-    features = detect_features(dark, nfeatures=enough)
-    assert 200 < at[0.04] < enough == positions(features)
-    assert len(features.notes) == 1 and "low light" in features.notes[0]
-    bright = pixels_of(texture(450, 600, contrast=0.35, mean=140))
-    assert "down to 0.02" in detect_features(bright, nfeatures=enough).notes[0]
-
-
 def test_smooth_ground_keeps_weaker_features_and_says_so() -> None:
     smooth = pixels_of(texture(450, 600, contrast=0.35, mean=140))
-    strict = positions(detect_features(smooth, nfeatures=4000, contrast_threshold=0.04))
+    strict = positions(detect_features(smooth, nfeatures=4000, contrast_floor=0.04))
     features = detect_features(smooth, nfeatures=4000)
     assert strict < positions(features) == 4000
     assert f"only {strict} keypoints reach the contrast threshold 0.04; 4000 were kept" in features.notes[0]
+
+
+@pytest.mark.parametrize("wta_k", [3, 4])
+def test_distance_of_orb_choices_among_three_or_four_is_opencvs(wta_k: int) -> None:
+    gray = texture()
+    found = detect_features(pixels_of(gray), detector="orb", nfeatures=200, orb=OrbOptions(wta_k=wta_k))
+    theirs = cv2.ORB.create(nfeatures=200, WTA_K=wta_k).detectAndCompute(gray, None)[1]  # pyright: ignore
+    ours = found.descriptors
+    assert ours.shape == (len(theirs), 64)
+
+    def distances(descriptors: np.ndarray, norm: int) -> np.ndarray:
+        return np.array([[cv2.norm(a[None], b[None], norm) for b in descriptors] for a in descriptors])
+
+    # OpenCV's order of keypoints is another
+    expected = np.sort(2 * distances(theirs, cv2.NORM_HAMMING2), axis=1)
+    actual = np.sort(distances(ours, cv2.NORM_HAMMING), axis=1)
+    assert np.array_equal(actual[np.lexsort(actual.T)], expected[np.lexsort(expected.T)])
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        OrbOptions(scale_factor=1.4), OrbOptions(nlevels=4), OrbOptions(edge_px=50), OrbOptions(patch_px=21),
+        OrbOptions(score="fast"), OrbOptions(fast_threshold=40),
+    ],
+)  # fmt: skip
+def test_every_option_of_orb_changes_what_is_found(changed: OrbOptions) -> None:
+    base, other = (detect_features(pixels_of(texture()), detector="orb", orb=orb) for orb in (OrbOptions(), changed))
+    assert not np.array_equal(base.descriptors, other.descriptors)
 
 
 def test_colours_are_those_under_the_keypoints() -> None:

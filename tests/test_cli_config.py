@@ -46,6 +46,10 @@ PUBLISHED = {  # the defaults and ranges that users of such pipelines know
     "crs.target_crs": ("none", ""),
     "crs.h_accuracy_threshold": ("2", "0.05 to 5"),
     "crs.altitude_variance": ("0.05", "0.01 to 0.5"),
+    "features.detector": ("auto", "auto, sift, orb, akaze"),
+    "features.nfeatures": ("none", "2000 to 20000"),
+    "features.contrast_threshold": ("none", "0.02 to 0.08"),
+    "features.edge_threshold": ("none", "5 to 20"),
     "features.sigma": ("1.6", "1 to 2.5"),
     "match.ratio": ("0.75", "0.6 to 0.85"),
     "match.ransac_threshold": ("none", "0.5 to 5"),
@@ -61,6 +65,9 @@ PUBLISHED = {  # the defaults and ranges that users of such pipelines know
     "adjust.track_threshold": ("2", "1 to 4"),
     "adjust.mad_factor": ("2.5", "2 to 5"),
     "adjust.edge_median_limit": ("3", "2 to 6"),
+    "tiles.chunk_size": ("500", "100 to 5000"),
+    "tiles.overlap": ("50", "10 to 1500"),
+    "workers.max_memory": ("0.8", ""),
 }
 
 

@@ -17,7 +17,8 @@ _SHOWN = 3
 
 
 def store_bytes(num_photos: int, params: Params) -> float:
-    """Return the bytes that the features of so many photos take on the disk at most."""
+    """Return the bytes that the features of so many photos take on the disk at most; `params` are settled."""
+    assert params.nfeatures is not None
     if params.detector in _DESCRIPTOR_BYTES:
         keypoint = _DESCRIPTOR_BYTES[params.detector] + _OTHER_BYTES
     else:

@@ -126,7 +126,7 @@ def _run_stage(
             _run_whole(project, stage, item, params)
         return collected(stage, done, items)[0], len(waiting), (), ()
     if waiting and isinstance(params, features.Params):
-        check_store(project.stage(stage.name), len(items), params, resources)
+        check_store(project.stage(stage.name), len(items), features.settled(params, items[0].inputs), resources)
     failed, notes = _run_photos(stage, items, waiting, params, resources, tell)
     by_name = {left.name: left for left in (*failed, *failures(items))}
     unused = tuple(by_name[name] for name in sorted(by_name))

@@ -20,6 +20,7 @@ from jaxba._errors import JaxbaError
 from jaxba.pipeline._key import plain
 from jaxba.pipeline._parameters import Parameters, allowed, taken
 from jaxba.pipeline._stages import STAGES
+from jaxba.pipeline._tiles import Tiles
 from jaxba.pipeline._workers import Resources
 
 Settings = Mapping[str, Parameters]
@@ -27,8 +28,8 @@ Settings = Mapping[str, Parameters]
 
 
 def default_settings() -> dict[str, Parameters]:
-    """Return every section's defaults: those of the stages, in their order, and of their workers."""
-    return {**{stage.name: stage.module.Params() for stage in STAGES}, "workers": Resources()}
+    """Return every section's defaults: those of the stages, in their order, of tiles, and of their workers."""
+    return {**{stage.name: stage.module.Params() for stage in STAGES}, "tiles": Tiles(), "workers": Resources()}
 
 
 def changed(settings: Settings, changes: Sequence[str]) -> dict[str, Parameters]:

@@ -57,6 +57,12 @@ def test_a_bad_change_says_what_is_allowed(text, message):
         changed(default_settings(), [text])
 
 
+@pytest.mark.parametrize("text", ["tiles.chunk_size=200", "tiles.overlap=40"])
+def test_what_would_have_no_effect_is_refused(text):
+    with pytest.raises(JaxbaError, match=rf"{text}: blocks are solved whole so far, whatever their size; leave"):
+        changed(default_settings(), [text])
+
+
 def test_none_is_a_value_only_where_it_is_allowed():
     assert changed(default_settings(), ["match.ransac_threshold=none"])["match"].ransac_threshold is None
     with pytest.raises(JaxbaError, match="give a number"):

@@ -9,7 +9,7 @@ from jaxba.pipeline._workers import Resources, bytes_of
 from jaxba.pipeline.features import Params
 from jaxba.scene import Left
 
-_OTHER_BYTES = 35  # of a keypoint: position, size and angle in float64, colour
+_OTHER_BYTES = 35.0  # of a keypoint: position, size and angle in float64, colour
 _DESCRIPTOR_BYTES = {"orb": 32, "akaze": 61}
 _SIFT_BYTES, _SIFT_ORIENTATIONS = 128, 1.3  # up to 1.25 were measured at 2000 keypoints a photo
 _PHOTO_BYTES = 6000  # record and headers
@@ -33,9 +33,9 @@ def check_store(store: Path, num_photos: int, params: Params, resources: Resourc
     """
     need = store_bytes(num_photos, params)
     place = next(folder for folder in (store, *store.absolute().parents) if folder.exists())
-    free = shutil.disk_usage(place).free
+    free = float(shutil.disk_usage(place).free)
     used = sum(path.stat().st_size for path in store.rglob("*") if path.is_file())
-    allowed = bytes_of(resources.max_store, float(free + used))
+    allowed = bytes_of(resources.max_store, free + used)
     if need > allowed:
         raise JaxbaError(
             f"the features of {num_photos:,} photos take up to {_size(need)} on the disk, at {params.nfeatures:,} "

@@ -41,6 +41,7 @@ def planted(file, *arguments, **named):
 PIL.Image.open = planted
 """
 TIME_LIMIT_S, MEMORY = 12, "1.5GB"
+QUICK = ("features.nfeatures=2000", "features.contrast_threshold=0.04", "adjust.max_rounds=2")
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ class Ended:
 
 
 def run(folder: Path, *arguments: str, planted: bool) -> Ended:
-    command = [sys.executable, "-m", "jaxba", "run", "photos", "--set", "features.nfeatures=2000", "--workers", "2"]
+    command = [sys.executable, "-m", "jaxba", "run", "photos", "--workers", "2"]
+    command += [part for change in QUICK for part in ("--set", change)]
     command += ["--max-memory", MEMORY, "--time-limit", str(TIME_LIMIT_S), "--quiet", "--log-json", *arguments]
     path = [str(folder / "plant")] if planted else []
     path += [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]

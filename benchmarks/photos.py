@@ -23,7 +23,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 IMAGES = Path(os.environ.get("JAXBA_DATA") or ROOT.parent / "shared" / "data") / "images"
 RESULTS = Path(__file__).parent / "results"
-_STAGES = ("metadata", "crs", "features", "pairs", "match", "tracks", "start", "adjust", "export")
+_STAGES = ("metadata", "crs", "pairs", "features", "match", "tracks", "start", "adjust", "export")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -14,8 +14,6 @@ from jaxtyping import Float, UInt8
 from jaxba.pipeline import features as detection
 from jaxba.scene import Features, Photo
 
-_SETTINGS = detection.Params(detector="sift", nfeatures=12000, contrast_threshold=0.03, edge_threshold=12.0)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FallbackKeypoints:
@@ -29,12 +27,21 @@ class FallbackKeypoints:
     rgb: UInt8[np.ndarray, "keypoints 3"]
 
 
-def detect_fallback(photo: Photo) -> Features:
-    """Return the SIFT features of a photo.
+def detect_fallback(
+    photo: Photo, *, nfeatures: int = 12000, contrast_threshold: float = 0.03, edge_threshold: float = 12.0
+) -> Features:
+    """Return the SIFT features of a photo, whatever condition holds for it.
 
     Raises `JaxbaError` where the file cannot be decoded any more, or has another size.
     """
-    return detection.run(detection.Inputs(photo=photo), _SETTINGS).features
+    params = detection.Params(
+        detector="sift",
+        condition="none",
+        nfeatures=nfeatures,
+        contrast_threshold=contrast_threshold,
+        edge_threshold=edge_threshold,
+    )
+    return detection.run(detection.Inputs(photo=photo), params).features
 
 
 class WithFallback(Mapping[int, Features]):

@@ -19,6 +19,7 @@ from jaxba.pipeline import adjust, crs, export, features, match, metadata, pairs
 from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
 from jaxba.pipeline._key import Key
+from jaxba.pipeline._pair_record import PairRecord
 from jaxba.pipeline._routing import Routing, route
 from jaxba.pipeline._store import load
 from jaxba.scene import Left, PhotoFile, Reference, ViewGraph
@@ -202,7 +203,7 @@ def _reference_of(reference: Reference, images: list[int], *, with_heights: bool
 
 
 def _match_collected(done: Done, folders: dict[int, Any], digests: dict[int, str]) -> match.Outputs:
-    graphs, num_fallback = [], 0
+    graphs, records = [], []
     fallback: dict[int, FallbackKeypoints] = {}
     for image in sorted(folders):
         part = load(folders[image], match.Outputs)
@@ -211,9 +212,10 @@ def _match_collected(done: Done, folders: dict[int, Any], digests: dict[int, str
         images = [image, *pairs[:, 1].tolist()]
         for entry in part.fallback:  # the same of an image, whichever photo it was matched with
             fallback.setdefault(images[entry.image], dataclasses.replace(entry, image=images[entry.image]))
-        num_fallback += part.num_fallback
+        records.append(part.record)
     found = tuple(fallback[image] for image in sorted(fallback))
-    return match.Outputs(view_graph=ViewGraph.concatenate(graphs), fallback=found, num_fallback=num_fallback)
+    graph, record = ViewGraph.concatenate(graphs), PairRecord.concatenate(records)  # rising already: the same order
+    return match.Outputs(view_graph=graph, record=record, fallback=found)
 
 
 def _tracks(done: Done) -> tracks.Inputs:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._events import Event, Run
+from jaxba.pipeline._pair_record import pair_facts, pair_lines
 from jaxba.pipeline._stages import Done
 from jaxba.scene import EdgeStatus, Left, ViewGraph
 
@@ -50,9 +51,7 @@ def stage_lines(event: Event) -> list[str]:
         good, weak = (int((graph.status == status).sum()) for status in (EdgeStatus.GOOD, EdgeStatus.WEAK))
         rejected = len(graph.pairs) - good - weak
         first = f"{good:,} good pairs, {weak:,} weak, {rejected:,} rejected; {len(graph.matches):,} matches"
-        again = outputs.num_fallback
-        notes = [f"{_many(again, 'pair')} failed with ORB and {'was' if again == 1 else 'were'} matched with SIFT."]
-        notes = [*(notes if again else ()), *_grouped(event.left_out)]
+        notes = [*pair_lines(graph, outputs.record), *_grouped(event.left_out)]
     elif event.stage == "tracks":
         tracks = outputs.tracks
         largest = f"{len(tracks.components[0])} of {_many(len(event.photos), 'photo')} in the largest group"
@@ -96,6 +95,8 @@ def summary(run: Run) -> dict[str, Any]:
         facts["pairs"] = {"candidates": len(done.pairs.pairs), "all": done.pairs.num_all, "method": done.pairs.method}
     if done.features is not None:
         facts["features"] = _features(done.features, names)
+    if done.match is not None:
+        facts["match"] = pair_facts(done.match.view_graph, done.match.record)
     if done.tracks is not None and len(done.tracks.tracks.components) > 1:
         facts["groups"] = [[names[image] for image in group] for group in done.tracks.tracks.components]
     if done.adjust is not None:

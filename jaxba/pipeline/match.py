@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxba.pipeline._fallback import FallbackKeypoints, detect_fallback
+from jaxba.pipeline._pair_record import Fallback, Missed, Model, PairRecord
 from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.scene import EdgeStatus, Features, Photo, Reference, ViewGraph
 from jaxba.vision import (
@@ -49,27 +50,42 @@ class Params(Parameters):
 
     ratio: float = parameter(0.75, low=0.6, high=0.85, help="nearest over second nearest descriptor distance")
     ransac_threshold: float | None = parameter(
-        None, low=0.5, high=5, help="px; none: 2 over 85% overlap, 3 up to 20 MP, 4 at width 3840 and more"
+        None,
+        low=0.5,
+        high=5,
+        help="px; none: 2 over 85% overlap, 3 at 12 to 20 MP, 4 at other widths of 3840 px and more, 3 below",
+    )
+    epipolar_threshold: float | None = parameter(
+        None, low=0.5, high=3, help="px, off the plane: of essential and fundamental matrices; none: ransac_threshold"
     )
     confidence: float = parameter(0.99, low=0.9, high=0.9999, help="of the sample consensus")
     min_inliers: int = parameter(12, low=8, high=30, help="fewer verified matches make no edge")
     min_good: int = parameter(30, low=8, high=100, help="verified matches of a good pair")
     min_inlier_ratio: float = parameter(0.35, low=0.2, high=0.8, help="verified over putative matches of a good pair")
     fallback_gsd: float = parameter(
-        0.03, low=0.005, high=0.5, help="m/px; a pair that fails with ORB is matched with SIFT over this ground sample"
+        0.03, low=0.005, high=0.5, help="m/px; a pair not good with ORB is matched with SIFT over this ground sample"
     )
+    fallback_nfeatures: int = parameter(12000, low=2000, high=20000, help="the most keypoints of SIFT then")
+    fallback_contrast: float = parameter(0.03, low=0.02, high=0.08, help="its contrast threshold")
+    fallback_edge: float = parameter(12.0, low=5, high=20, help="its edge threshold")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
     """- `view_graph`: the photo's pairs.
     - `fallback`: SIFT keypoints of photos with a pair that failed with ORB and was matched with SIFT. Its matches count
-      them on from the photo's ORB features. `num_fallback`: how many such pairs there are.
+      them on from the photo's ORB features.
+    - `record`: what was decided on each pair, in the view graph's order.
     """
 
     view_graph: ViewGraph
+    record: PairRecord
     fallback: tuple[FallbackKeypoints, ...] = ()
-    num_fallback: int = 0
+
+    @property
+    def num_fallback(self) -> int:
+        """How many pairs were matched with SIFT after ORB."""
+        return int((self.record.fallback == Fallback.TAKEN).sum())
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
@@ -77,33 +93,48 @@ def run(inputs: Inputs, params: Params) -> Outputs:
 
     Keypoints at one position, of several orientations, all take part; matches speak of the first of them. A pair that
     fails is an edge of status `REJECTED`, without matches, its figures kept. Where the features are ORB and the pair's
-    ground sample distance is known to be coarse, it is matched with SIFT before it is given up.
+    ground sample distance is known to be coarse, a pair that is not good is matched with SIFT, too, and the better of
+    both is kept.
 
     Raises `JaxbaError` where that needs a photo which cannot be decoded any more.
     """
     features = inputs.features[inputs.image]
     prepared = prepare_descriptors(features)
     own: tuple[Features, Descriptors] | None = None  # SIFT, once a pair asks for it
-    parts, fallback = [], {}
-    num_fallback = 0
+    edges, records, fallback = [], [], {}
     for partner, overlap in zip(inputs.partners.tolist(), inputs.overlap.tolist(), strict=True):
         others = inputs.features[partner]
-        edge = _matched(inputs, partner, overlap, features, prepared, others, params)
-        if not edge.is_edge[0] and _may_fall_back(inputs, partner, features, others, params):
+        edge, record = _matched(inputs, partner, overlap, features, prepared, others, params)
+        outcome, gsd_m = _may_fall_back(inputs, partner, edge, features, others, params)
+        if outcome == Fallback.TAKEN:
             if own is None:
-                found = detect_fallback(inputs.photos[inputs.image])
+                found = _sift(inputs, inputs.image, params)
                 own = found, prepare_descriptors(found)
-            sift = detect_fallback(inputs.photos[partner])
-            again = _matched(inputs, partner, overlap, *own, sift, params)
-            if again.is_edge[0]:
+            sift = _sift(inputs, partner, params)
+            again, its_record = _matched(inputs, partner, overlap, *own, sift, params)
+            if (again.status[0], again.num_inliers[0]) > (edge.status[0], edge.num_inliers[0]):
                 behind = np.array([features.num_keypoints, others.num_keypoints], np.int32)
-                edge = dataclasses.replace(again, matches=again.matches + behind)
+                edge, record = dataclasses.replace(again, matches=again.matches + behind), its_record
                 for image, kind in ((inputs.image, own[0]), (partner, sift)):
                     fallback[image] = FallbackKeypoints(image=image, xy_px=kind.xy_px, rgb=kind.rgb)
-                num_fallback += 1
-        parts.append(edge)
-    graph = ViewGraph.concatenate(parts)
-    return Outputs(view_graph=graph, fallback=tuple(fallback.values()), num_fallback=num_fallback)
+            else:
+                outcome = Fallback.NOT_BETTER
+        edges.append(edge)
+        records.append(dataclasses.replace(record, fallback=np.array([outcome], np.uint8), gsd_m=np.array([gsd_m])))
+    return Outputs(
+        view_graph=ViewGraph.concatenate(edges),
+        record=PairRecord.concatenate(records),
+        fallback=tuple(fallback.values()),
+    )
+
+
+def _sift(inputs: Inputs, image: int, params: Params) -> Features:
+    return detect_fallback(
+        inputs.photos[image],
+        nfeatures=params.fallback_nfeatures,
+        contrast_threshold=float(params.fallback_contrast),
+        edge_threshold=float(params.fallback_edge),
+    )
 
 
 def _matched(
@@ -114,18 +145,20 @@ def _matched(
     prepared: Descriptors,
     others: Features,
     params: Params,
-) -> ViewGraph:
-    """Return the view graph of one pair, matched by features of one kind."""
+) -> tuple[ViewGraph, PairRecord]:
+    """Return the view graph of one pair, matched by features of one kind, and how it was verified."""
     first, second = inputs.photos[inputs.image], inputs.photos[partner]
     matches, distinctiveness = _matches(
         features, prepared, others, first, second, params.ratio, may_be_apart=not np.isfinite(overlap)
     )
+    threshold_px = float(params.ransac_threshold or _threshold_px(first, second, overlap))
     two_view = verify(
         features.xy_px[matches[:, 0]],
         others.xy_px[matches[:, 1]],
         _pinhole(first),
         _pinhole(second),
-        threshold_px=float(params.ransac_threshold or _threshold_px(first, second, overlap)),
+        threshold_px=threshold_px,
+        epipolar_threshold_px=None if params.epipolar_threshold is None else float(params.epipolar_threshold),
         confidence=float(params.confidence),
         min_inliers=params.min_inliers,
         prior=_prior(inputs.reference, inputs.image, partner),
@@ -135,17 +168,40 @@ def _matched(
         grid_coverage(features.xy_px[inliers[:, 0]], first.width_px, first.height_px),
         grid_coverage(others.xy_px[inliers[:, 1]], second.width_px, second.height_px),
     )
-    return _edge(inputs.image, partner, matches, distinctiveness, coverage, two_view, params)
+    missed = _missed(len(matches), two_view, params)
+    record = PairRecord.of(
+        threshold_px=threshold_px,
+        model=Model[two_view.model.upper()],
+        missed=missed,
+        num_verified=two_view.num_explained,
+    )
+    return _edge(inputs.image, partner, matches, distinctiveness, coverage, two_view, missed), record
 
 
-def _may_fall_back(inputs: Inputs, partner: int, features: Features, others: Features, params: Params) -> bool:
-    """Whether a failed pair has ORB features and a ground sample distance that is known and coarse enough."""
-    if features.detector != "orb" or others.detector != "orb":
-        return False
+def _missed(num_matches: int, two_view: TwoView, params: Params) -> Missed:
+    """Return the first figure that a pair misses."""
+    num_inliers = int(two_view.is_inlier.sum())
+    if num_matches < params.min_inliers:
+        return Missed.MATCHES
+    if num_inliers < params.min_inliers:
+        return Missed.VERIFIED
+    if num_inliers < params.min_good:
+        return Missed.MIN_GOOD
+    return Missed.NOTHING if num_inliers >= params.min_inlier_ratio * num_matches else Missed.MIN_INLIER_RATIO
+
+
+def _may_fall_back(
+    inputs: Inputs, partner: int, edge: ViewGraph, features: Features, others: Features, params: Params
+) -> tuple[Fallback, float]:
+    """Return whether a pair that is not good is to be matched with SIFT, or why not, and its ground sample distance."""
+    if edge.status[0] == EdgeStatus.GOOD or features.detector != "orb" or others.detector != "orb":
+        return Fallback.NONE, np.nan
     images = [inputs.image, partner]
     focal_px = np.array([inputs.photos[i].focal_px or np.nan for i in images])
     gsd_m = float(np.mean(inputs.reference.height_above_ground_m[images] / focal_px))
-    return gsd_m > params.fallback_gsd  # not where it is NaN
+    if np.isnan(gsd_m):
+        return Fallback.GSD_UNKNOWN, gsd_m
+    return (Fallback.TAKEN if gsd_m > params.fallback_gsd else Fallback.GSD_TOO_FINE), gsd_m
 
 
 def _matches(
@@ -184,14 +240,13 @@ def _edge(
     distinctiveness: Float[np.ndarray, " matches"],
     coverage: float,
     two_view: TwoView,
-    params: Params,
+    missed: Missed,
 ) -> ViewGraph:
     """Return the view graph of one pair."""
     inliers = matches[two_view.is_inlier]
     status = EdgeStatus.REJECTED
-    if len(inliers) >= params.min_inliers:
-        is_good = len(inliers) >= params.min_good and len(inliers) >= params.min_inlier_ratio * len(matches)
-        status = EdgeStatus.GOOD if is_good else EdgeStatus.WEAK
+    if missed not in (Missed.MATCHES, Missed.VERIFIED):
+        status = EdgeStatus.GOOD if missed == Missed.NOTHING else EdgeStatus.WEAK
     has_pose = bool(np.isfinite(two_view.direction).all())
     quaternion = np.full(4, np.nan)
     if has_pose:
@@ -217,10 +272,14 @@ def _pinhole(photo: Photo) -> Pinhole:
 
 
 def _threshold_px(first: Photo, second: Photo, overlap: float) -> float:
-    """Return the threshold that fits a pair's overlap and resolution; an unknown overlap counts as a low one."""
+    """Return the threshold that fits a pair's overlap and resolution; an unknown overlap counts as a low one.
+
+    Of two sizes the one with the larger threshold counts. 12 to 20 MP come before the width, which is over 3840 there.
+    """
     if overlap > 0.85:
         return 2.0
-    return 4.0 if max(first.megapixels, second.megapixels) > 20 else 3.0
+    sizes = [(photo.megapixels, max(photo.width_px, photo.height_px)) for photo in (first, second)]
+    return max(3.0 if 12 <= megapixels <= 20 or side < 3840 else 4.0 for megapixels, side in sizes)
 
 
 def _prior(reference: Reference, i: int, j: int) -> PosePrior | None:

@@ -10,7 +10,8 @@ eq. 12 to 14), over n matches with residuals e and a sigma of half the threshold
 
     GRIC = sum min(e^2 / sigma^2, 2 (4 - d)) + n d log 4 + k log 4n
 
-d is 2 for a homography and 3 for an epipolar geometry; k is 8 and 5 (essential) or 7 (fundamental).
+d is 2 for a homography and 3 for an epipolar geometry; k is 8 and 5 (essential) or 7 (fundamental). The threshold of
+the epipolar geometry is that of the homography, unless it is set.
 
 Planes. Matches that keep to the epipolar lines and lie off the plane by up to 20 thresholds are trees and roofs, 4 to
 7% of the inliers on flat nadir surveys, and tell most of heights: they stay. A homography decomposes to two poses that
@@ -22,7 +23,7 @@ Cost: about 5 ms a pair of some hundred matches.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -51,12 +52,15 @@ class TwoView:
     """What verification made of a pair's matches.
 
     - `is_inlier`: of each match. `is_planar`: the homography is the better model.
+    - `model`: the better one; `none` where neither explains enough. `num_explained`: inliers of it, also then.
     - `rotation`, `direction`: `x_j = R x_i + t`, t of unit length; NaN without a pose.
     - `residual_px`: median over the inliers, of the chosen model. `angle_rad`: median angle between the inliers' rays.
     """
 
     is_inlier: Bool[np.ndarray, " matches"]
     is_planar: bool
+    model: Literal["none", "essential", "fundamental", "homography"]
+    num_explained: int
     rotation: Float[np.ndarray, "3 3"]
     direction: Float[np.ndarray, "3"]
     residual_px: float
@@ -92,11 +96,14 @@ def verify(
     second: Pinhole,
     *,
     threshold_px: float,
+    epipolar_threshold_px: float | None = None,
     confidence: float = 0.99,
     min_inliers: int = 12,
     prior: PosePrior | None = None,
 ) -> TwoView:
     """Return the inliers of the better of two models, and the relative pose where the focal lengths are known.
+
+    `threshold_px`: of the homography, and of the epipolar geometry where `epipolar_threshold_px` is None.
 
     Matches that lie at the same pixel of both images are none of the scene's: a watermark, dust on the sensor, the
     aircraft's own gear. They are outliers. Fewer than `min_inliers` inliers of the rest count as none.
@@ -112,26 +119,28 @@ def verify(
     moved = np.linalg.norm(first_px - second_px, axis=1) > 1.0
     x, y = first_px[moved], second_px[moved]
     if len(x) < max(min_inliers, 8):
-        return _nothing(len(moved))
+        return _nothing(len(moved), 0)
+    line_px = threshold_px if epipolar_threshold_px is None else epipolar_threshold_px
     calibrated = first.focal_px is not None and second.focal_px is not None
-    pose = _essential(x, y, first, second, threshold_px, confidence) if calibrated else None
-    fundamental = _fundamental_of(pose, first, second) if pose else _fundamental(x, y, threshold_px, confidence)
+    pose = _essential(x, y, first, second, line_px, confidence) if calibrated else None
+    fundamental = _fundamental_of(pose, first, second) if pose else _fundamental(x, y, line_px, confidence)
     homography = _homography(x, y, threshold_px, confidence)
     epipolar_px = sampson_px(fundamental, x, y) if fundamental is not None else np.full(len(x), np.inf)
     plane_px = transfer_px(homography, x, y) if homography is not None else np.full(len(x), np.inf)
-    sigma = threshold_px / 2
-    is_planar = _gric(plane_px / sigma, 2, 8) < _gric(epipolar_px / sigma, 3, 5 if calibrated else 7)
+    plane_gric = _gric(2 * plane_px / threshold_px, 2, 8)
+    is_planar = plane_gric < _gric(2 * epipolar_px / line_px, 3, 5 if pose else 7)
     residual = plane_px if is_planar else epipolar_px
-    relief = (epipolar_px < threshold_px) & (plane_px < _RELIEF * threshold_px)
-    inlier = (residual < threshold_px) | (relief if is_planar else False)
-    if np.count_nonzero(inlier) < min_inliers:
-        return _nothing(len(moved))
+    relief = (epipolar_px < line_px) & (plane_px < _RELIEF * threshold_px)
+    inlier = (plane_px < threshold_px) | relief if is_planar else epipolar_px < line_px
+    num_explained = int(np.count_nonzero(inlier))
+    if num_explained < min_inliers:
+        return _nothing(len(moved), num_explained)
     is_inlier = moved.copy()
     is_inlier[moved] = inlier
     rotation, direction, angle = np.full((3, 3), np.nan), np.full(3, np.nan), np.nan
     if calibrated and pose is not None:
         if is_planar and homography is not None and prior is not None:
-            pose = _nearest_pose(pose, homography, x[inlier], y[inlier], first, second, threshold_px, prior)
+            pose = _nearest_pose(pose, homography, x[inlier], y[inlier], first, second, line_px, prior)
         length = float(np.linalg.norm(pose.t))
         rotation, direction = np.asarray(pose.R), np.asarray(pose.t) / (length if length > 0 else 1.0)
         cosine = np.sum((first.rays(x[inlier]) @ rotation.T) * second.rays(y[inlier]), axis=1)
@@ -139,6 +148,8 @@ def verify(
     return TwoView(
         is_inlier=is_inlier,
         is_planar=bool(is_planar),
+        model="homography" if is_planar else "essential" if pose is not None else "fundamental",
+        num_explained=num_explained,
         rotation=rotation,
         direction=direction,
         residual_px=float(np.median(residual[inlier])),
@@ -269,10 +280,12 @@ def _mapped(
         return mapped[:, :2] / mapped[:, 2:]
 
 
-def _nothing(num_matches: int) -> TwoView:
+def _nothing(num_matches: int, num_explained: int) -> TwoView:
     return TwoView(
         is_inlier=np.zeros(num_matches, bool),
         is_planar=False,
+        model="none",
+        num_explained=num_explained,
         rotation=np.full((3, 3), np.nan),
         direction=np.full(3, np.nan),
         residual_px=np.nan,

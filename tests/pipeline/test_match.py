@@ -8,8 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxba.pipeline import match
+from jaxba.pipeline._pair_record import Fallback, Missed, Model, pair_facts, pair_lines
 from jaxba.scene import EdgeStatus, Features, Photo, Reference, ViewGraph
-from jaxba.vision import Pixels, decode, detect_features
+from jaxba.vision import Pixels, TwoView, decode, detect_features
 
 FOCAL_PX = 936.0
 
@@ -147,6 +148,68 @@ def test_threshold_follows_overlap_and_resolution() -> None:
     assert match._threshold_px(medium, medium, 0.8) == 3
     assert match._threshold_px(medium, medium, np.nan) == 3
     assert match._threshold_px(large, medium, 0.8) == 4
+    video = photo_of("d", width_px=3840, height_px=2160)  # 8 MP
+    assert match._threshold_px(video, video, 0.8) == 4 and match._threshold_px(video, video, 0.9) == 2
+    twelve = photo_of("e", width_px=4000, height_px=3000)
+    assert match._threshold_px(twelve, small, 0.8) == 3
+
+
+def test_what_was_decided_on_each_pair_is_kept_with_its_figures(frames: list[Features]) -> None:
+    inputs = replace(inputs_of(frames), overlap=np.array([0.9, 0.5, np.nan]))
+    outputs = match.run(inputs, match.Params())
+    record, graph = outputs.record, outputs.view_graph
+    assert record.threshold_px.tolist() == [2, 3, 3]
+    plane = [Model.HOMOGRAPHY if planar else Model.ESSENTIAL for planar in graph.is_planar[:2]]
+    assert record.model.tolist() == [*plane, Model.NONE]
+    assert record.num_verified[:2].tolist() == graph.num_inliers[:2].tolist() and record.num_verified[2] < 12
+    assert record.missed[0] == Missed.NOTHING and record.missed[2] in (Missed.MATCHES, Missed.VERIFIED)
+    assert record.fallback.tolist() == [Fallback.NONE] * 3
+    lines = pair_lines(graph, record)
+    assert lines[0] == "RANSAC threshold 3 px on 2 pairs, 2 px on 1 pair."
+    assert any(line.startswith("Rejected (match.min_inliers): 1 pair with") for line in lines)
+    assert pair_facts(graph, record)["thresholds_px"] == {"2": 1, "3": 2}
+    unknown = match.run(inputs_of(frames[:2], focal_px=None), match.Params()).record
+    assert unknown.model.tolist()[0] in (Model.FUNDAMENTAL, Model.HOMOGRAPHY)
+
+
+def test_weak_pairs_are_counted_by_the_figure_that_they_miss(frames: list[Features]) -> None:
+    outputs = match.run(inputs_of(frames), match.Params())
+    graph = replace(outputs.view_graph, num_putative=np.array([80, 400, 9], np.int32))
+    record = replace(
+        outputs.record,
+        missed=np.array([Missed.MIN_GOOD, Missed.MIN_INLIER_RATIO, Missed.MATCHES], np.uint8),
+        num_verified=np.array([29, 100, 0], np.int32),
+    )
+    assert pair_lines(graph, record)[-2:] == [
+        "Rejected (match.min_inliers): 1 pair with 9 matches before verification.",
+        "Weak: 1 pair with 29 verified matches (match.min_good), 1 pair with 25% of the matches verified "
+        "(match.min_inlier_ratio).",
+    ]
+    assert pair_facts(graph, record)["missed"] == {"matches": 1, "min_good": 1, "min_inlier_ratio": 1}
+
+
+@pytest.mark.parametrize(
+    ("num_matches", "num_inliers", "missed"),
+    [
+        (11, 0, Missed.MATCHES), (12, 11, Missed.VERIFIED), (400, 12, Missed.MIN_GOOD), (30, 29, Missed.MIN_GOOD),
+        (100, 34, Missed.MIN_INLIER_RATIO), (100, 35, Missed.NOTHING), (30, 30, Missed.NOTHING),
+    ],
+)  # fmt: skip
+def test_the_first_figure_that_is_missed_is_named(num_matches: int, num_inliers: int, missed: Missed) -> None:
+    two_view = TwoView(
+        is_inlier=np.arange(num_matches) < num_inliers, is_planar=False, model="essential", num_explained=num_inliers,
+        rotation=np.eye(3), direction=np.array([1.0, 0, 0]), residual_px=1.0, angle_rad=0.1,
+    )  # fmt: skip
+    assert match._missed(num_matches, two_view, match.Params()) == missed
+
+
+def test_epipolar_threshold_is_that_of_matches_off_the_plane(frames: list[Features]) -> None:
+    counts = {}
+    for threshold in (None, 3.0, 0.5):
+        run = match.run(inputs_of(frames[:2]), match.Params(epipolar_threshold=threshold))
+        counts[threshold] = int(run.view_graph.num_inliers[0])
+        assert run.record.threshold_px.tolist() == [3]
+    assert counts[None] == counts[3.0] > counts[0.5]
 
 
 def test_prior_is_the_relative_pose_of_the_reference() -> None:

@@ -11,6 +11,7 @@ from jaxba.pipeline import _stages, default_settings, match, metadata, pairs, tr
 from jaxba.pipeline._fallback import WithFallback, detect_fallback
 from jaxba.pipeline._fingerprint import fingerprint
 from jaxba.pipeline._key import Key
+from jaxba.pipeline._pair_record import Fallback, Missed, pair_lines
 from jaxba.pipeline._store import save
 from jaxba.scene import Block, EdgeStatus, Features, Photo, Reference, Tracks
 from jaxba.sfm._complete import complete_tracks
@@ -98,11 +99,50 @@ def test_fine_or_unknown_ground_sample_distance_rejects_the_pair(
     outputs = run(photos[:2], orb, height_m)
     assert outputs.view_graph.status.tolist() == [EdgeStatus.REJECTED]
     assert outputs.fallback == () and outputs.num_fallback == 0
+    assert outputs.record.fallback.tolist() == [Fallback.GSD_TOO_FINE if height_m == 10 else Fallback.GSD_UNKNOWN]
+    lines = pair_lines(outputs.view_graph, outputs.record)
+    why = (
+        "1 pair too fine for SIFT, 2 cm/px (match.fallback_gsd)" if height_m == 10 else "1 pair without a known ground"
+    )
+    assert why in lines[-1] and "1 of these are rejected" in lines[-1]
+    assert "Rejected (match.min_inliers): 1 pair with" in lines[-2]
 
 
 def test_the_limit_is_a_parameter(photos: tuple[Photo, ...], orb: dict[int, Features]) -> None:
     assert run(photos[:2], orb, 10.0, match.Params(fallback_gsd=0.019)).num_fallback == 1
     assert run(photos[:2], orb, COARSE_M, match.Params(fallback_gsd=0.051)).num_fallback == 0
+
+
+def test_a_weak_pair_falls_back_and_the_better_of_both_is_kept(photos: tuple[Photo, ...]) -> None:
+    found = {i: detect_features(decode(p.path), detector="orb", nfeatures=150) for i, p in enumerate(photos[:2])}
+    lenient, strict = match.Params(), match.Params(min_good=100)
+    by_orb = run(photos[:2], found, np.nan, strict)
+    assert by_orb.view_graph.status.tolist() == [EdgeStatus.WEAK]
+    assert by_orb.record.missed.tolist() == [Missed.MIN_GOOD]
+    assert run(photos[:2], found, COARSE_M, strict).record.fallback.tolist() == [Fallback.TAKEN]
+    assert run(photos[:2], found, COARSE_M, lenient).record.fallback.tolist() == [Fallback.NONE]
+    blank = photos[0].path.with_name("blank.png")
+    cv2.imwrite(str(blank), np.zeros((450, 600), np.uint8))
+    kept = run((photos[0], replace(photos[1], path=blank)), found, COARSE_M, strict)
+    assert kept.record.fallback.tolist() == [Fallback.NOT_BETTER] and kept.fallback == ()
+    assert np.array_equal(kept.view_graph.matches, by_orb.view_graph.matches)
+    assert "1 pair no better with SIFT" in pair_lines(kept.view_graph, kept.record)[-1]
+
+
+@pytest.mark.parametrize("changed", [{"fallback_contrast": 0.08}, {"fallback_edge": 5.0}])
+def test_how_sift_looks_then_are_parameters(
+    photos: tuple[Photo, ...], orb: dict[int, Features], outputs: match.Outputs, changed: dict[str, float]
+) -> None:
+    fewer = run(photos, orb, COARSE_M, match.Params(**changed))
+    assert [len(a.xy_px) < len(b.xy_px) for a, b in zip(fewer.fallback, outputs.fallback, strict=True)] == [True] * 3
+
+
+def test_the_most_keypoints_of_sift_are_a_parameter(photos: tuple[Photo, ...], tmp_path: Path) -> None:
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(450, 600)), (0, 0), 1.2)
+    cv2.imwrite(str(tmp_path / "rich.png"), np.clip(128 + 200 * noise, 0, 255).astype(np.uint8))
+    rich = replace(photos[0], path=tmp_path / "rich.png")
+    found = [detect_fallback(rich, nfeatures=count) for count in (2000, 12000)]
+    assert [len(np.unique(f.xy_px, axis=0)) > 2000 for f in found] == [False, True]
 
 
 def test_sift_features_have_no_fallback(photos: tuple[Photo, ...], orb: dict[int, Features]) -> None:

@@ -142,7 +142,7 @@ def test_damaged_records_are_made_anew(made: Survey, tmp_path: Path):
     for name, content in damaged.items():
         (survey.project / "stages" / name / "record.json").write_text(content)
     run = survey.run()
-    assert run.stages_run == ("metadata", "features", "pairs", "match")
+    assert run.stages_run == ("metadata", "pairs", "features", "match")
     assert made_anew(before, inodes(survey.project / "stages")) == set(damaged)
 
 

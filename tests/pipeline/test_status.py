@@ -49,7 +49,7 @@ def test_a_changed_photo_makes_its_features_stale_alone(made: Survey, tmp_path: 
     with open(survey.photos / FIRST, "ab") as file:
         file.write(b"\0")  # behind the end of the JPEG
     assert standing(survey)["metadata"] == ("stale", "changed: files")
-    survey.run(until="crs")
+    survey.run(until="pairs")
     found = status(survey.project, project_settings(survey.project))
     features = next(stage for stage in found.stages if stage.stage == "features")
     assert (features.state, features.num_done, features.reason) == ("stale", NUM_PHOTOS - 1, "changed: photo")

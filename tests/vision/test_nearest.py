@@ -5,7 +5,7 @@ from scipy.spatial.distance import cdist
 
 from jaxba.scene import Features
 from jaxba.vision import match_descriptors, prepare_descriptors
-from jaxba.vision._nearest import ratio_matches, two_nearest, two_nearest_hamming, unit_descriptors
+from jaxba.vision._nearest import ratio_matches, signed_bits, two_nearest, two_nearest_hamming, unit_descriptors
 
 
 def sift_like(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -70,12 +70,24 @@ def test_hamming_is_that_of_counted_bits() -> None:
     rng = np.random.default_rng(0)
     a, b = (rng.integers(0, 256, (count, 32), dtype=np.uint8) for count in (80, 90))
     distance = 256 * cdist(np.unpackbits(a, axis=1), np.unpackbits(b, axis=1), "hamming")
-    found = two_nearest_hamming(a, b)
+    found = two_nearest_hamming(signed_bits(a), signed_bits(b))
     np.testing.assert_array_equal(found.nearest, distance.min(axis=1).round())
     np.testing.assert_array_equal(found.second, np.sort(distance, axis=1)[:, 1].round())
     assert np.array_equal(distance[np.arange(80), found.index].round(), found.nearest)
-    mutual = distance.argmin(axis=0)[found.index] == np.arange(80)
-    assert np.array_equal(found.is_mutual, mutual)
+    shared = found.nearest == distance.min(axis=0)[found.index].round()
+    earlier = [k for k in range(80) if any(shared[j] and found.index[j] == found.index[k] for j in range(k))]
+    assert np.array_equal(np.flatnonzero(found.is_mutual), np.setdiff1d(np.flatnonzero(shared), earlier))
+
+
+def test_bits_are_matched_as_by_opencv() -> None:
+    rng = np.random.default_rng(1)
+    a = rng.integers(0, 256, (300, 32), dtype=np.uint8)
+    b = a[rng.permutation(300)] ^ (rng.random((300, 32)) < 0.3).astype(np.uint8)
+    theirs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a, b, k=2)
+    found = two_nearest_hamming(signed_bits(a), signed_bits(b))
+    assert found.index.tolist() == [near.trainIdx for near, _ in theirs]
+    assert found.nearest.tolist() == [near.distance for near, _ in theirs]
+    assert found.second.tolist() == [other.distance for _, other in theirs]
 
 
 @pytest.mark.parametrize("bits", [False, True])

@@ -144,6 +144,27 @@ def test_unknown_focal_length_gives_inliers_and_no_pose() -> None:
     assert np.isnan(found.rotation).all() and np.isnan(found.direction).all() and np.isnan(found.angle_rad)
 
 
+def test_the_better_model_is_named_and_its_inliers_counted_even_where_they_are_too_few() -> None:
+    unknown = Pinhole(width_px=1600, height_px=1200, focal_px=None)
+    flat, hilly = image_pair(0), image_pair(0, relief_m=25)
+    found = [verify(pair[0], pair[1], c, c, threshold_px=3.0) for pair in (flat, hilly) for c in (CAMERA, unknown)]
+    assert [one.model for one in found] == ["homography", "homography", "essential", "fundamental"]
+    assert all(one.num_explained == one.is_inlier.sum() for one in found)
+    few = verify(hilly[0], hilly[1], CAMERA, CAMERA, threshold_px=3.0, min_inliers=350)
+    assert few.model == "none" and 200 < few.num_explained < 350 and not few.is_inlier.any()
+
+
+def test_each_model_has_a_threshold_of_its_own() -> None:
+    hilly, flat = image_pair(3, relief_m=25, outliers=0.0), image_pair(3, outliers=0.0)
+    counts = [
+        verify(hilly[0], hilly[1], CAMERA, CAMERA, threshold_px=3.0, epipolar_threshold_px=line).num_explained
+        for line in (None, 3.0, 0.5)
+    ]
+    assert counts[0] == counts[1] > 1.2 * counts[2]
+    tight = verify(flat[0], flat[1], CAMERA, CAMERA, threshold_px=0.5, epipolar_threshold_px=3.0)
+    assert tight.num_explained > 380  # those off the tight plane keep to the lines
+
+
 def test_random_matches_are_no_inliers() -> None:
     rng = np.random.default_rng(0)
     for count in (0, 5, 12, 40):

@@ -68,6 +68,10 @@ PUBLISHED = {  # the defaults and ranges that users of such pipelines know
     "tiles.chunk_size": ("500", "100 to 5000"),
     "tiles.overlap": ("50", "10 to 1500"),
     "workers.max_memory": ("0.8", ""),
+    "verify.max_median_px": ("1", "0.1 to 5"),
+    "verify.min_inlier_rate": ("0.9", "0.5 to 1"),
+    "match.epipolar_threshold": ("none", "0.5 to 3"),
+    "match.fallback_nfeatures": ("12000", "2000 to 20000"),
 }
 
 

@@ -180,6 +180,23 @@ def status(
     return run(project, config=config, changes=set_, as_json=json)
 
 
+@app.command(
+    help="Check the exports of a project: files, form, numbers, errors, CRS and place, each with its figure.\n\n"
+    "Exit codes: 0 all is well, 1 a check failed, 2 no project, or nothing exported yet."
+)
+def verify(
+    project: _Project,
+    /,
+    *,
+    config: Annotated[Path | None, Parameter(help="Limits to hold it against. [default: its last run's]")] = None,
+    set_: _Set = (),
+    json: _Json = False,
+) -> int:
+    from jaxba.cli._verify import run
+
+    return run(project, config=config, changes=set_, as_json=json)
+
+
 @app.command(help="Print a jaxba.toml with every parameter: its default, range and one line of meaning.")
 def config(
     file: Annotated[Path | None, Parameter(help="Print the settings of this file. [default: jaxba.toml here]")] = None,

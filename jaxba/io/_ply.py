@@ -13,12 +13,12 @@ from jaxba.io._atomic import write_atomically
 from jaxba.io._cloud import Cloud
 from jaxba.io._crs import CrsText
 
-_VERTEX = np.dtype(
+VERTEX = np.dtype(
     [(name, "<f8") for name in "xyz"]
     + [(name, "u1") for name in ("red", "green", "blue")]
     + [("error_px", "<f4"), ("track_length", "<i4"), ("point_id", "<i4")]
 )
-_PLY_TYPES = {"<f8": "double", "|u1": "uchar", "<f4": "float", "<i4": "int"}
+PLY_TYPES = {"<f8": "double", "|u1": "uchar", "<f4": "float", "<i4": "int"}
 
 
 def write_ply(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText | None) -> None:
@@ -37,7 +37,7 @@ def write_ply(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText | None) -
     b'ply\\nformat binary_little_endian 1.0\\n'
     """
     cloud.check(os.fspath(path))
-    vertices = np.empty(cloud.num_points, _VERTEX)
+    vertices = np.empty(cloud.num_points, VERTEX)
     for name, column in zip("xyz", cloud.xyz.T, strict=True):
         vertices[name] = column
     for name, column in zip(("red", "green", "blue"), cloud.rgb.T, strict=True):
@@ -53,7 +53,7 @@ def write_ply(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText | None) -
         "format binary_little_endian 1.0",
         f"comment crs {' '.join(place.split())}".encode("ascii", "replace").decode(),
         f"element vertex {cloud.num_points}",
-        *(f"property {_PLY_TYPES[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()),
+        *(f"property {PLY_TYPES[VERTEX[name].str]} {name}" for name in VERTEX.names or ()),
         "end_header",
     ]
     with write_atomically(path) as file:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxba._errors import JaxbaError
+from jaxba.pipeline import verify
 from jaxba.pipeline._key import plain
 from jaxba.pipeline._parameters import Parameters, allowed, taken
 from jaxba.pipeline._stages import STAGES
@@ -28,8 +29,9 @@ Settings = Mapping[str, Parameters]
 
 
 def default_settings() -> dict[str, Parameters]:
-    """Return every section's defaults: those of the stages, in their order, of tiles, and of their workers."""
-    return {**{stage.name: stage.module.Params() for stage in STAGES}, "tiles": Tiles(), "workers": Resources()}
+    """Return every section's defaults: those of the stages, in their order, of tiles, workers and checks."""
+    stages = {stage.name: stage.module.Params() for stage in STAGES}
+    return {**stages, "tiles": Tiles(), "workers": Resources(), "verify": verify.Params()}
 
 
 def changed(settings: Settings, changes: Sequence[str]) -> dict[str, Parameters]:

@@ -48,8 +48,16 @@ def assert_scipy_agrees(dense: Dense, found: Minimum, *, from_start: bool = Fals
     return vector
 
 
-@pytest.mark.parametrize("index", range(len(LOSSES)), ids=lambda i: repr(LOSSES[i]))
-@pytest.mark.parametrize("camera", EVERY_CAMERA, ids=lambda camera: type(camera).__name__)
+EVERY_LOSS_WITH_ONE_CAMERA = [(RADIAL, index) for index in range(len(LOSSES))]
+TWO_LOSSES_WITH_THE_OTHERS = [(camera, index) for camera in EVERY_CAMERA if camera is not RADIAL for index in (0, 2)]
+EVERY_LOSS_AND_CAMERA = pytest.mark.parametrize(
+    ("camera", "index"),
+    EVERY_LOSS_WITH_ONE_CAMERA + TWO_LOSSES_WITH_THE_OTHERS,
+    ids=lambda value: repr(LOSSES[value]) if isinstance(value, int) else type(value).__name__,
+)
+
+
+@EVERY_LOSS_AND_CAMERA
 def test_bounded_optimum_equals_scipy(camera, index):
     problem, loss = bounded(small_problem(camera, num_outliers=3), 0.01), one_of(index)
     found = minimise(problem, loss, SchurLevenbergMarquardt(**EXACT))
@@ -58,15 +66,7 @@ def test_bounded_optimum_equals_scipy(camera, index):
     assert ((vector == dense.lower) | (vector == dense.upper)).any()
 
 
-EVERY_LOSS_WITH_ONE_CAMERA = [(RADIAL, index) for index in range(len(LOSSES))]
-TWO_LOSSES_WITH_THE_OTHERS = [(camera, index) for camera in EVERY_CAMERA if camera is not RADIAL for index in (0, 2)]
-
-
-@pytest.mark.parametrize(
-    ("camera", "index"),
-    EVERY_LOSS_WITH_ONE_CAMERA + TWO_LOSSES_WITH_THE_OTHERS,
-    ids=lambda value: repr(LOSSES[value]) if isinstance(value, int) else type(value).__name__,
-)
+@EVERY_LOSS_AND_CAMERA
 def test_optimum_within_wide_bounds_equals_scipy(camera, index):
     problem, loss = bounded(small_problem(camera, num_outliers=3), 1e3), one_of(index)
     found = minimise(problem, loss, SchurLevenbergMarquardt(**EXACT))

@@ -1,5 +1,6 @@
 """What the features stage found: the features of each photo, how each was looked at, and the block's decision."""
 
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -13,13 +14,17 @@ from jaxba.scene import Features
 class Detected(Mapping[int, Features]):
     """Features by image index, opened on access.
 
-    - `tunings`: how each photo was looked at. `routing`: of the block; it does not count for a fingerprint.
+    - `routing`: of the block; it does not count for a fingerprint.
     """
 
     def __init__(self, folders: Mapping[int, Path], digests: Mapping[int, str], routing: Routing) -> None:
         self.features: Stored[Features] = Stored(Outputs, "features", folders, digests)
-        self.tunings: Stored[Tuning] = Stored(Outputs, "tuning", folders, digests)
         self.routing = routing
+
+    @functools.cached_property
+    def tunings(self) -> Mapping[int, Tuning]:
+        """How each photo was looked at."""
+        return dict(Stored(Outputs, "tuning", self.features.folders, self.features.digests))
 
     @property
     def digests(self) -> Mapping[int, str]:

@@ -7,6 +7,7 @@ are looked at. Checking those of 500 photos (600 MB) takes under a second.
 """
 
 import errno
+import functools
 import hashlib
 import json
 import os
@@ -226,6 +227,7 @@ def _files_to_arrays(tree: Any, folder: Path) -> Any:
     return tree
 
 
+@functools.cache
 def _converter() -> cattrs.Converter:
     converter = cattrs.Converter()
     converter.register_unstructure_hook(np.ndarray, lambda array: array)

@@ -197,6 +197,21 @@ def verify(
     return run(project, config=config, changes=set_, as_json=json)
 
 
+@app.command(
+    help="Tell what looks poor in a project, the likely cause with its figures, and the cure; also of a run that "
+    "stopped or was killed.\n\nExit codes: 0 told, 2 no project."
+)
+def diagnose(
+    project: _Project,
+    /,
+    *,
+    json: _Json = False,
+) -> int:
+    from jaxba.cli._diagnose import run
+
+    return run(project, as_json=json)
+
+
 @app.command(help="Print a jaxba.toml with every parameter: its default, range and one line of meaning.")
 def config(
     file: Annotated[Path | None, Parameter(help="Print the settings of this file. [default: jaxba.toml here]")] = None,

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.scene import Block, Features, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Features, Left, Photo, Reference, Tracks, ViewGraph
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +61,7 @@ class Outputs:
     - `median_px`, `inlier_rate`, `variance_factor`, `num_rejected`, `rounds`: figures of the adjustment.
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
+    - `pruned`: edges left out, with the reason. `solver`: why the last solve stopped, as `Solution.result` names it.
     - `findings`: what a surveyor should know, in sentences: ambiguities, contradictions, bounds reached.
     """
 
@@ -81,6 +82,8 @@ class Outputs:
     std_px: float
     position_scale: Float[np.ndarray, "3"]
     findings: tuple[str, ...] = ()
+    pruned: tuple[Left, ...] = ()
+    solver: str = ""
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
@@ -119,4 +122,6 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         std_px=adjusted.std_px,
         position_scale=adjusted.position_scale,
         findings=found,
+        pruned=adjusted.pruned,
+        solver=adjusted.solution.result,
     )

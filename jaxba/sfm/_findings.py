@@ -11,6 +11,7 @@ from scipy import stats
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Photo, Reference
 from jaxba.sfm._adjust import Adjusted
+from jaxba.sfm._bounds import intrinsics_at_bounds
 from jaxba.sfm._problem import natural_intrinsics, used_positions
 from jaxba.sfm._uncertainty import Uncertainty
 
@@ -263,16 +264,18 @@ def _geometry(block: Block, height_m: Float[np.ndarray, " images"]) -> str:
 def _intrinsics(block: Block, start: Block, photos: Sequence[Photo]) -> list[str]:
     natural = natural_intrinsics(start, photos)
     names = CAMERAS[block.camera_model].parameter_names()
+    at_bound = {(bound.camera, bound.parameter): bound for bound in intrinsics_at_bounds(block, start, photos)}
     found = []
     for c, label in enumerate(block.camera_names):
         values = block.camera_parameters[c]
         width = 2 * natural.center[c, names.index("cx")]
         for k, name in enumerate(names):
-            low, high, value = natural.lower[c, k], natural.upper[c, k], values[k]
-            margin = 1e-3 * (high - low)
-            if value <= low + margin or value >= high - margin:
+            value = values[k]
+            if (label, name) in at_bound:
+                bound = at_bound[label, name]
                 found.append(
-                    f"Camera {label}: {name} is at its bound ({value:.4g}, allowed {low:.4g} to {high:.4g}): the "
+                    f"Camera {label}: {name} is at its bound ({value:.4g}, allowed {bound.low:.4g} to "
+                    f"{bound.high:.4g}): the "
                     "calibration takes up another error. Check the focal length and the camera model, add oblique "
                     "photos or control, or hold it fixed."
                 )

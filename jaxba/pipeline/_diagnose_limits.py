@@ -1,0 +1,105 @@
+"""Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
+
+from dataclasses import replace
+
+from jaxba.pipeline._diagnosis import Diagnosis, some
+from jaxba.pipeline._limits import store_bytes
+from jaxba.pipeline._recorded import Recorded
+from jaxba.pipeline._workers import Resources, bytes_of, machine_memory, memory_for
+
+_BY_PHOTOS = ("features", "match")
+
+
+def killed(case: Recorded) -> Diagnosis | None:
+    """The run was killed: what it needed there against what the machine has."""
+    if case.killed is None:
+        return None
+    stage, photos = case.killed, () if case.done.metadata is None else case.done.photos
+    resources: Resources = case.done.settings["workers"]
+    cause, figures = f"The run was killed in stage {stage}", {"stage": stage}
+    if photos and stage in _BY_PHOTOS:
+        largest = max(photos, key=lambda photo: photo.megapixels)
+        need = memory_for(largest.megapixels)
+        count = resources.num_workers(need)
+        figures |= {"workers": count, "need_bytes": count * need, "allowed_bytes": resources.memory_bytes}
+        cause += (
+            f": {count} workers take up to {count * need / 1e9:.1f} GB at {largest.megapixels:.1f} megapixels, "
+            f"workers.max_memory={resources.max_memory} allows {resources.memory_bytes / 1e9:.1f} GB of "
+            f"{machine_memory() / 1e9:.1f} GB"
+        )
+    elif photos:
+        size = "" if case.done.tracks is None else f", {case.done.tracks.tracks.num_observations:,} observations"
+        cause += f": {len(photos):,} photos{size}, {machine_memory() / 1e9:.1f} GB of memory"
+    return Diagnosis(
+        name="killed",
+        cause=f"{cause}. By the system where memory ended, by a time limit, or by hand.",
+        cure="Run again: what is done is kept. If it is killed in the same stage again, set fewer features.nfeatures, "
+        "use fewer --workers or a lower --max-memory, or smaller parts of the block.",
+        figures=figures,
+    )
+
+
+def over_memory(case: Recorded) -> Diagnosis | None:
+    """Photos that cannot be worked on within the memory that is allowed, or whose worker died of it."""
+    if case.done.metadata is None:
+        return None
+    resources: Resources = case.done.settings["workers"]
+    allowed = resources.memory_bytes
+    need = {photo.name: memory_for(photo.megapixels) for photo in case.done.photos}
+    over = [name for name, count in need.items() if count > allowed]
+    lost = {left.name: left for name in _BY_PHOTOS for left in case.failed.get(name, ()) if "memory" in left.reason}
+    names = [*over, *(name for name in lost if name not in over)]
+    if not names:
+        return None
+    largest = max(need[name] for name in names)
+    why = f", the first: {next(iter(lost.values())).reason.rstrip('.')}" if lost else ""
+    return Diagnosis(
+        name="out of memory",
+        cause=f"{len(names)} of {len(need)} photos do not fit into the memory ({some(names, 3)}): one takes up to "
+        f"{largest / 1e9:.1f} GB, workers.max_memory={resources.max_memory} allows {allowed / 1e9:.1f} GB{why}.",
+        cure="Raise --max-memory, use fewer --workers, set fewer features.nfeatures, or scale the photos down.",
+        figures={"photos": names, "need_bytes": largest, "allowed_bytes": allowed},
+    )
+
+
+def over_store(case: Recorded) -> Diagnosis | None:
+    """Features that would not fit on the disk."""
+    if case.stopped is None or case.stopped.name != "features" or case.done.pairs is None:
+        return None
+    resources: Resources = case.done.settings["workers"]
+    params = replace(case.done.settings["features"], detector=case.done.routing.detector)
+    need, allowed = store_bytes(len(case.done.photos), params), bytes_of(resources.max_store, float("nan"))
+    if not need > allowed:
+        return None
+    return Diagnosis(
+        name="out of disk",
+        cause=f"Features of {len(case.done.photos):,} photos take up to {need / 1e9:.2f} GB on the disk, "
+        f"workers.max_store={resources.max_store} allows {allowed / 1e9:.2f} GB.",
+        cure="Set fewer features.nfeatures, take fewer photos, or raise --max-store.",
+        figures={"need_bytes": need, "allowed_bytes": allowed},
+    )
+
+
+def out_of_date(case: Recorded) -> Diagnosis | None:
+    """A run that ended, whose records are of other inputs or other code: they say nothing."""
+    if case.stale is None or case.stopped is not None or case.killed is not None or case.running is not None:
+        return None
+    return Diagnosis(
+        name="out of date",
+        cause=f"What stage {case.stale} recorded was made from other inputs or parameters, or by another version of "
+        "jaxba: it is not looked at, nor what follows it.",
+        cure="Run again; `jaxba status` tells what has to be made anew.",
+        figures={"stage": case.stale},
+    )
+
+
+def stopped(case: Recorded) -> Diagnosis | None:
+    """What the run itself said when it stopped."""
+    if case.stopped is None:
+        return None
+    return Diagnosis(
+        name="stopped",
+        cause=f"The run stopped in stage {case.stopped.name}: {case.stopped.reason}",
+        cure="Do what the message says and run again: what is done is kept.",
+        figures={"stage": case.stopped.name},
+    )

@@ -1,0 +1,74 @@
+"""What the stages of a project have recorded, also of a run that stopped or was killed; nothing is run or changed."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxba.pipeline import _store
+from jaxba.pipeline._lock import holder
+from jaxba.pipeline._project import SETTINGS, SUMMARY, Project
+from jaxba.pipeline._settings import default_settings, from_toml
+from jaxba.pipeline._stages import STAGES, Done
+from jaxba.pipeline._work import collected, works
+from jaxba.scene import Left
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What is known of a project's last run.
+
+    - `done`: what the stages recorded, those that come before the first one without a record; its `files` are empty.
+    - `stopped`: the stage in which the run ended with an error, and the error; None where it did not.
+    - `killed`: the stage in which it was killed; None where it was not. `running`: who works on it now, else None.
+    - `stale`: the first stage whose record was made from other inputs or parameters, or by other code; else None.
+    - `failed`: photos of which a stage could make nothing, by stage: also those whose worker died.
+    """
+
+    done: Done
+    stopped: Left | None
+    killed: str | None
+    running: str | None
+    stale: str | None
+    failed: dict[str, tuple[Left, ...]]
+
+
+def recorded(folder: Path) -> Recorded:
+    """Return what the stages of a project have recorded under its last run's settings.
+
+    Records of earlier runs, made from other inputs or parameters, are passed over, and all that would follow them.
+
+    Raises `JaxbaError` where the folder is no project.
+    """
+    project = Project(folder, make=False)
+    settings = from_toml(project.folder / SETTINGS, default_settings())
+    _, stage_now = project.read_given()
+    running = holder(project.folder)
+    done = Done(files=(), settings=settings)
+    failed: dict[str, tuple[Left, ...]] = {}
+    stale = None
+    for stage in STAGES:
+        if stage.name == "metadata":  # its inputs are the files, which may have moved since
+            if _store.read_record(project.stage(stage.name)) is None:
+                break
+            done.metadata = _store.load(project.stage(stage.name), stage.module.Outputs)
+            continue
+        items = [item for item in works(project, stage, done, settings[stage.name]) if item.record is not None]
+        if not items:
+            stale = stage.name if project.stage(stage.name).exists() else None
+            break
+        outputs, failed[stage.name] = collected(stage, done, items)
+        setattr(done, stage.name, outputs)
+    summary = project.read_json(SUMMARY)
+    ended = summary if isinstance(summary, dict) and stage_now is None else {}
+    for entry in ended.get("left_out", ()):  # a worker that died leaves no record
+        others = failed.get(entry["stage"], ())
+        if entry["stage"] in ("features", "match") and entry["name"] not in {left.name for left in others}:
+            failed[entry["stage"]] = (*others, Left(name=entry["name"], reason=entry["reason"]))
+    stopped = ended.get("stopped")
+    return Recorded(
+        done=done,
+        stopped=Left(name=stopped["stage"], reason=stopped["reason"]) if isinstance(stopped, dict) else None,
+        killed=stage_now if running is None else None,
+        running=running,
+        stale=stale,
+        failed=failed,
+    )

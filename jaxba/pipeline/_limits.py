@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxba._errors import JaxbaError
+from jaxba.pipeline._tuning import tune
 from jaxba.pipeline._workers import Resources, bytes_of
 from jaxba.pipeline.features import Params
 from jaxba.scene import Left
@@ -16,29 +17,30 @@ _PHOTO_BYTES = 6000  # record and headers
 _SHOWN = 3
 
 
-def store_bytes(num_photos: int, params: Params) -> float:
-    """Return the bytes that the features of so many photos take on the disk at most; `params` are settled."""
-    assert params.nfeatures is not None
-    if params.detector in _DESCRIPTOR_BYTES:
-        keypoint = _DESCRIPTOR_BYTES[params.detector] + _OTHER_BYTES
+def store_bytes(num_photos: int, detector: str, nfeatures: int) -> float:
+    """Return the bytes that the features of so many photos take on the disk at most."""
+    if detector in _DESCRIPTOR_BYTES:
+        keypoint = _DESCRIPTOR_BYTES[detector] + _OTHER_BYTES
     else:
         keypoint = (_SIFT_BYTES + _OTHER_BYTES) * _SIFT_ORIENTATIONS
-    return num_photos * (params.nfeatures * keypoint + _PHOTO_BYTES)
+    return num_photos * (nfeatures * keypoint + _PHOTO_BYTES)
 
 
-def check_store(store: Path, num_photos: int, params: Params, resources: Resources) -> None:
+def check_store(store: Path, num_photos: int, detector: str, params: Params, resources: Resources) -> None:
     """Raise `JaxbaError` where the features of so many photos may not fit, or may take more than is allowed.
 
-    `store`: the folder where they are to lie. What lies there already is theirs, or is replaced: it counts as free.
+    - `store`: the folder where they are to lie; what lies there already is theirs, or is replaced: it counts as free.
+    - `detector`: of all photos.
     """
-    need = store_bytes(num_photos, params)
+    nfeatures = tune(detector, (), None, nfeatures=params.nfeatures).nfeatures
+    need = store_bytes(num_photos, detector, nfeatures)
     place = next(folder for folder in (store, *store.absolute().parents) if folder.exists())
     free = float(shutil.disk_usage(place).free)
     used = sum(path.stat().st_size for path in store.rglob("*") if path.is_file())
     allowed = bytes_of(resources.max_store, free + used)
     if need > allowed:
         raise JaxbaError(
-            f"the features of {num_photos:,} photos take up to {_size(need)} on the disk, at {params.nfeatures:,} "
+            f"the features of {num_photos:,} photos take up to {_size(need)} on the disk, at {nfeatures:,} "
             f"keypoints a photo; --max-store {resources.max_store} allows {_size(allowed)}, {_size(free)} are free. "
             "Set fewer features.nfeatures, take fewer photos, raise --max-store, or choose an --out on a larger disk."
         )

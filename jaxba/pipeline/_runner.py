@@ -42,7 +42,6 @@ def run_pipeline(
     """Run the pipeline on a folder of photos, up to and with the stage `until`; what is unchanged is not run again.
 
     - `out`: the project folder. `settings`: parameters by stage. `geotags`: a list that replaces the photos' tags.
-    - `resources`: of the workers, in place of the settings' own.
 
     Raises `JaxbaError` where the photos, the parameters or the folder make a result impossible, and where another run
     works on the project; the stages before it are kept.
@@ -126,7 +125,7 @@ def _run_stage(
             _run_whole(project, stage, item, params)
         return collected(stage, done, items)[0], len(waiting), (), ()
     if waiting and isinstance(params, features.Params):
-        check_store(project.stage(stage.name), len(items), features.settled(params, items[0].inputs), resources)
+        check_store(project.stage(stage.name), len(items), items[0].inputs.detector, params, resources)
     failed, notes = _run_photos(stage, items, waiting, params, resources, tell)
     by_name = {left.name: left for left in (*failed, *failures(items))}
     unused = tuple(by_name[name] for name in sorted(by_name))

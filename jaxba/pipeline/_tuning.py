@@ -17,7 +17,7 @@ from jaxba.vision import ImageStatistics
 CONDITIONS = ("low_light", "rows", "water", "varying_height")
 
 _DARK, _REPEATING, _FLAT = 80.0, 0.2, 0.3
-DEFAULTS: dict[str, dict[str, float | int]] = {
+_BASE: dict[str, dict[str, float | int]] = {
     "sift": {"nfeatures": 8000, "contrast_threshold": 0.04, "edge_threshold": 10.0},
     "orb": {"nfeatures": 10000, "fast_threshold": 20, "nlevels": 8},
     "akaze": {"nfeatures": 8000},
@@ -78,7 +78,7 @@ def tune(
         "nlevels": nlevels,
     }
     measured = {} if statistics is None else _measured(statistics)
-    values = {name: base if given[name] is None else given[name] for name, base in DEFAULTS[detector].items()}
+    values = {name: base if given[name] is None else given[name] for name, base in _BASE[detector].items()}
     reasons = []
     for condition in (c for c in CONDITIONS if c in conditions or c in measured):
         why = measured.get(condition, "of the block" if condition == "varying_height" else "set by features.condition")

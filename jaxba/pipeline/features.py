@@ -1,10 +1,10 @@
 """Stage features: keypoints and descriptors of one photo; the runner calls it once a photo, in worker processes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.pipeline._tuning import CONDITIONS, DEFAULTS, Tuning, tune
+from jaxba.pipeline._tuning import CONDITIONS, Tuning, tune
 from jaxba.scene import Features, Photo
 from jaxba.vision import OrbOptions, Pixels, decode, detect_features, measure_image
 
@@ -104,12 +104,6 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         nlevels=params.nlevels,
     )
     return Outputs(features=_detect(pixels, tuning, params), tuning=tuning)
-
-
-def settled(params: Params, inputs: Inputs) -> Params:
-    """Return the parameters with the block's detector, and the number of keypoints that it gets."""
-    detector = inputs.detector if params.detector == "auto" else params.detector
-    return replace(params, detector=detector, nfeatures=params.nfeatures or int(DEFAULTS[detector]["nfeatures"]))
 
 
 def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:

@@ -90,7 +90,7 @@ def test_a_bad_photo_is_not_tried_again_and_a_photo_that_could_not_be_read_is(
 def test_the_features_of_a_survey_take_no_more_than_was_estimated(made: Survey):
     files = (made.project / "stages" / "features").rglob("*")
     taken = sum(path.stat().st_size for path in files if path.is_file())
-    estimated = store_bytes(NUM_PHOTOS, features.Params(nfeatures=2000))
+    estimated = store_bytes(NUM_PHOTOS, "sift", 2000)
     assert 0.6 * estimated < taken <= estimated
 
 
@@ -101,19 +101,19 @@ def test_features_that_do_not_fit_are_refused_with_the_figures_and_the_cures(tmp
     )
     store = tmp_path / "stages" / "features"
     with pytest.raises(JaxbaError, match=message):
-        check_store(store, 10_000, features.Params(), Resources(max_store="1GB"))
-    check_store(store, 500, features.Params(), Resources(max_store="1GB"))
-    check_store(store, 10_000, features.Params(detector="orb", nfeatures=2000), Resources(max_store="2GB"))
+        check_store(store, 10_000, "sift", features.Params(), Resources(max_store="1GB"))
+    check_store(store, 500, "sift", features.Params(), Resources(max_store="1GB"))
+    check_store(store, 10_000, "orb", features.Params(nfeatures=2000), Resources(max_store="2GB"))
 
 
 def test_what_is_stored_already_counts_as_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1_000_000}))
     params = features.Params(nfeatures=2000)
     with pytest.raises(JaxbaError, match=r"up to 4\.\d MB .* --max-store 0.9 allows 900.0 kB, 1.0 MB are free"):
-        check_store(tmp_path, 10, params, Resources())
+        check_store(tmp_path, 10, "sift", params, Resources())
     (tmp_path / "SIM_0001.JPG").mkdir()
     (tmp_path / "SIM_0001.JPG" / "features.descriptors.npy").write_bytes(bytes(4_000_000))
-    check_store(tmp_path, 10, params, Resources())
+    check_store(tmp_path, 10, "sift", params, Resources())
 
 
 def test_a_run_without_room_for_its_features_stops_before_the_first(photos: Path, tmp_path: Path):

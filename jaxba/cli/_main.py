@@ -124,6 +124,8 @@ def run(
     geotags: Annotated[
         Path | None, Parameter(help="A geo.txt or CSV in place of the tags. [default: geo.txt among the photos]")
     ] = None,
+    gcp: Annotated[Path | None, Parameter(help="Control points: a gcp_list.txt or CSV.")] = None,
+    check: Annotated[Path | None, Parameter(help="Check points, in the same form: only compared.")] = None,
     require_connected: Annotated[
         bool, Parameter(negative="", show_default=False, help="Stop where the photos fall into several groups.")
     ] = False,
@@ -153,6 +155,8 @@ def run(
         crs=crs,
         focal=focal,
         geotags=geotags,
+        gcp=gcp,
+        check=check,
         stage=stage,
         changes=set_,
         require_connected=require_connected,

@@ -29,6 +29,8 @@ def run(
     crs: str | None,
     focal: float | None,
     geotags: Path | None,
+    gcp: Path | None,
+    check: Path | None,
     stage: str | None,
     changes: Sequence[str],
     require_connected: bool,
@@ -67,7 +69,7 @@ def run(
         settings = changed(settings, workers.changes())
         use_compilation_cache()
         with contextlib.nullcontext() if show is None else steps_told(show.step):
-            result = run_pipeline(photos, out, settings, until=stage, geotags=geotags, tell=tell)
+            result = run_pipeline(photos, out, settings, until=stage, geotags=geotags, gcp=gcp, check=check, tell=tell)
     except KeyboardInterrupt:
         if json_lines is not None:
             json_lines.say("interrupted", stage=current)

@@ -4,6 +4,7 @@ Arrays in, arrays out. Order is always x (east or longitude), then y (north or l
 """
 
 from jaxba.geo._attitudes import local_attitudes
+from jaxba.geo._control import AS_PHOTOS, Surveyed, elsewhere, heights_above, surveyed_points
 from jaxba.geo._crs import describe, parse_crs, target_crs, utm_zone
 from jaxba.geo._frame import (
     geodetic_from_local,
@@ -19,8 +20,9 @@ from jaxba.geo._operation import Operation, horizontal_operation
 from jaxba.geo._positions import Measured, measured_positions
 
 __all__ = [
-    "UNTRUSTED", "HeightDrift", "HeightStep", "Judgement", "Measured", "Operation", "describe", "frame_notes",
-    "geodetic_from_local", "height_notes", "height_step", "horizontal_operation", "judge_positions", "local_attitudes",
-    "local_frame", "local_from_geodetic", "local_from_projected", "measured_positions", "parse_crs",
-    "projected_from_local", "target_crs", "utm_zone",
+    "AS_PHOTOS", "UNTRUSTED", "HeightDrift", "HeightStep", "Judgement", "Measured", "Operation", "Surveyed",
+    "describe", "elsewhere", "frame_notes", "geodetic_from_local", "height_notes", "height_step", "heights_above",
+    "horizontal_operation", "judge_positions", "local_attitudes", "local_frame", "local_from_geodetic",
+    "local_from_projected", "measured_positions", "parse_crs", "projected_from_local", "surveyed_points",
+    "target_crs", "utm_zone",
 ]  # fmt: skip

@@ -103,7 +103,7 @@ def target_crs(
     named = f"{label}={text if len(text) < 60 else text[:57] + '...'}, {describe(crs)},"
     _refuse_wrong_kind(crs, named, fitting)
     if len(lon):
-        _refuse_wrong_place(crs, lon, lat, named, fitting)
+        refuse_wrong_place(crs, lon, lat, named, fitting)
     return crs
 
 
@@ -152,9 +152,10 @@ def _refuse_wrong_kind(crs: CRS, named: str, fitting: str) -> None:
         raise JaxbaError(f"{named} has axes in two units, {axes[0].unit_name} and {axes[1].unit_name}. {cure}")
 
 
-def _refuse_wrong_place(
+def refuse_wrong_place(
     crs: CRS, lon: Float[np.ndarray, " positions"], lat: Float[np.ndarray, " positions"], named: str, fitting: str
 ) -> None:
+    """Raise where a CRS is not made for the place of a survey; `named` and `fitting` begin and end the message."""
     survey = f"the survey lies around longitude {middle(lon, lat)[0]:.4f}, latitude {middle(lon, lat)[1]:.4f}"
     area = horizontal_part(crs).area_of_use or crs.area_of_use
     if area is None:

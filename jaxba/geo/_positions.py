@@ -63,7 +63,9 @@ def measured_positions(
     notes: list[str] = []
     for text in sorted({position.crs for position in positions if position} - {"EPSG:4326", "EPSG:4979"}):
         rows = [k for k, position in enumerate(positions) if position and position.crs == text]
-        lon[rows], lat[rows], found = _to_wgs84(text, numbers[rows, 0], numbers[rows, 1], photos[rows[0]])
+        first = photos[rows[0]]
+        label = f"{first.name} ({first.position.source if first.position else ''}): position's CRS"
+        lon[rows], lat[rows], found = to_wgs84(text, numbers[rows, 0], numbers[rows, 1], label, "positions")
         notes += found
     missing = ~(np.isfinite(lon) & np.isfinite(lat)) | (np.abs(lat) > 90) | (np.abs(lon) > 180)
     missing |= (lon == 0) & (lat == 0)  # what a receiver without a fix writes
@@ -116,10 +118,13 @@ def _sigmas(
     return np.stack([std_h, std_h, std_v], axis=1)
 
 
-def _to_wgs84(
-    text: str, x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"], photo: Photo
+def to_wgs84(
+    text: str, x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"], label: str, what: str
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"], list[str]]:
-    label = f"{photo.name} ({photo.position.source if photo.position else ''}): position's CRS"
+    """Return longitude and latitude of x, y in a CRS, and how well the step is known.
+
+    - `label`: where the CRS stands; `what`: is transformed; both for messages.
+    """
     crs = parse_crs(text, label)
     flat = horizontal_part(crs)
     if not (flat.is_projected or flat.is_geographic) or flat.geodetic_crs is None:
@@ -132,7 +137,7 @@ def _to_wgs84(
     place = float(np.median(rough[0][known])), float(np.median(rough[1][known]))
     operation = horizontal_operation(crs, *place)
     lon, lat = operation.inverse(x, y)
-    return lon, lat, operation_notes(f"positions in {describe(crs)}", operation)
+    return lon, lat, operation_notes(f"{what} in {describe(crs)}", operation)
 
 
 def operation_notes(what: str, operation: Operation) -> list[str]:

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from jaxba.io._colmap import write_colmap_binary, write_colmap_text
     from jaxba.io._crs import CrsText
     from jaxba.io._csv_cloud import write_csv_cloud
+    from jaxba.io._gcp import ControlList, Mark, SurveyedPoint, parse_control
     from jaxba.io._geopackage import write_geojson, write_geopackage
-    from jaxba.io._geotag_match import match_geotags
+    from jaxba.io._geotag_match import match_geotags, photo_finder
     from jaxba.io._geotags import Geotag, Geotags, parse_geotags
     from jaxba.io._las import write_las
     from jaxba.io._opensfm import write_opensfm
@@ -28,24 +29,29 @@ if TYPE_CHECKING:
     from jaxba.io._tile import read_tile, write_tile
 
 __all__ = [
-    "SCHEMA", "Cloud", "ColmapModel", "CrsText", "Geotag", "Geotags", "Sites", "make_sites", "match_geotags",
-    "parse_geotags", "read_bal", "read_colmap_text", "read_problem", "read_tile", "refuse_same_file",
-    "schema_markdown", "what_bal_cannot_hold", "write_atomically", "write_bal", "write_colmap_binary",
-    "write_colmap_text", "write_csv_cloud", "write_geojson", "write_geopackage", "write_las", "write_opensfm",
-    "write_ply", "write_tile",
+    "SCHEMA", "Cloud", "ColmapModel", "ControlList", "CrsText", "Geotag", "Geotags", "Mark", "Sites", "SurveyedPoint",
+    "make_sites", "match_geotags", "parse_control", "parse_geotags", "photo_finder", "read_bal", "read_colmap_text",
+    "read_problem", "read_tile", "refuse_same_file", "schema_markdown", "what_bal_cannot_hold", "write_atomically",
+    "write_bal", "write_colmap_binary", "write_colmap_text", "write_csv_cloud", "write_geojson", "write_geopackage",
+    "write_las", "write_opensfm", "write_ply", "write_tile",
 ]  # fmt: skip
 
 _MODULE_OF = {
     "SCHEMA": "jaxba.io._schema",
     "Cloud": "jaxba.io._cloud",
     "ColmapModel": "jaxba.io._read_colmap",
+    "ControlList": "jaxba.io._gcp",
     "CrsText": "jaxba.io._crs",
     "Geotag": "jaxba.io._geotags",
     "Geotags": "jaxba.io._geotags",
+    "Mark": "jaxba.io._gcp",
     "Sites": "jaxba.io._sites",
+    "SurveyedPoint": "jaxba.io._gcp",
     "make_sites": "jaxba.io._sites",
     "match_geotags": "jaxba.io._geotag_match",
+    "parse_control": "jaxba.io._gcp",
     "parse_geotags": "jaxba.io._geotags",
+    "photo_finder": "jaxba.io._geotag_match",
     "read_bal": "jaxba.io._bal",
     "read_colmap_text": "jaxba.io._read_colmap",
     "read_problem": "jaxba.io._problem",

@@ -1,6 +1,6 @@
 """Which entry of a list belongs to which photo; what is only in one of the two is named."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import PurePosixPath
 
 from jaxba._errors import JaxbaError
@@ -24,24 +24,18 @@ def match_geotags(
     >>> found["flight1/a.jpg"].position.y, notes[1]
     (2.0, 'geo.txt does not list flight1/b.jpg: the tags stand.')
     """
-    keys: dict[tuple[int, str], list[str]] = {}
-    for photo in photos:
-        for key in enumerate(_keys(photo)):
-            keys.setdefault(key, []).append(photo)
+    find = photo_finder(photos)
     found: dict[str, Geotag] = {}
     unknown = []
     for entry in geotags.entries:
-        matches = next((keys[key] for key in enumerate(_keys(entry.name.replace("\\", "/"))) if key in keys), [])
-        if len(matches) > 1:
-            several = " or ".join(matches[:3])
-            raise JaxbaError(f"{name} line {entry.line}: {entry.name} may be {several}; write the folder too.")
-        if not matches:
+        photo = find(entry.name, f"{name} line {entry.line}")
+        if photo is None:
             unknown.append(entry.name)
-        elif matches[0] in found:
-            before = found[matches[0]].line
-            raise JaxbaError(f"{name} lines {before} and {entry.line}: both are {matches[0]}; keep one of them.")
+        elif photo in found:
+            before = found[photo].line
+            raise JaxbaError(f"{name} lines {before} and {entry.line}: both are {photo}; keep one of them.")
         else:
-            found[matches[0]] = entry
+            found[photo] = entry
     if not found:
         raise JaxbaError(
             f"{name} lists none of the photos: it names {_some(unknown, 3)}, the folder holds {_some(photos, 3)}; "
@@ -54,6 +48,25 @@ def match_geotags(
     if unknown:
         notes.append(f"{name} lists what is no usable photo: {_some(unknown)}.")
     return found, [*notes, *geotags.notes]
+
+
+def photo_finder(photos: Sequence[str]) -> Callable[[str, str], str | None]:
+    """Return a function from a name in a list, and where it stands, to the photo that it means; None for none.
+
+    The function raises `JaxbaError` where the name may be several photos.
+    """
+    keys: dict[tuple[int, str], list[str]] = {}
+    for photo in photos:
+        for key in enumerate(_keys(photo)):
+            keys.setdefault(key, []).append(photo)
+
+    def find(name: str, where: str) -> str | None:
+        matches = next((keys[key] for key in enumerate(_keys(name.replace("\\", "/"))) if key in keys), [])
+        if len(matches) > 1:
+            raise JaxbaError(f"{where}: {name} may be {' or '.join(matches[:3])}; write the folder too.")
+        return matches[0] if matches else None
+
+    return find
 
 
 def _keys(name: str) -> tuple[str, str, str]:

@@ -17,15 +17,22 @@ a list whose median pitch is under -30 degrees is taken for a gimbal's, since th
 other reading.
 """
 
-import csv
-import io
-import math
-import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import median
 
 from jaxba._errors import JaxbaError
+from jaxba.io._list_text import (
+    CRS_COLUMN,
+    Line,
+    columns_by_name,
+    content_lines,
+    crs_of_comment,
+    csv_rows,
+    header_titles,
+    read_crs,
+    read_number,
+    refuse_degrees_out_of_range,
+)
 from jaxba.scene import Position
 from jaxba.scene._photo import HeightKind
 
@@ -50,9 +57,8 @@ _COLUMNS = {
         "vertical_accuracy", "v_acc", "v_accuracy", "accuracy_vertical", "vert_accuracy", "std_v", "std_v_m",
         "accuracy_vert",
     ),
-    "crs": ("crs", "srs", "epsg"),
+    "crs": CRS_COLUMN,
 }  # fmt: skip
-_UTM = re.compile(r"WGS\s*_?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 _GIMBAL_PITCH_DEG = -30.0
 
 
@@ -89,14 +95,12 @@ def parse_geotags(text: str, name: str = "geo.txt") -> Geotags:
     >>> parse_geotags("EPSG:4326\\nDJI_0028.JPG -91.9942 46.8425 198.6").entries[0].position.z_m
     198.6
     """
-    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
-    content = [(number, line) for number, line in lines if line and not line.startswith("#")]
+    content, comment = content_lines(text)
     if not content:
         raise JaxbaError(f"{name}: is empty; give a CRS line and a line a photo, or a CSV with a header line.")
-    header = _split(content[0][1])
+    header = header_titles(content[0][1], _COLUMNS["name"])
     if header is not None:
-        comment = next((line.lstrip("# ") for _, line in lines if line), "") if lines[0][1].startswith("#") else ""
-        entries, notes = _read_csv(content, header, _crs_of_comment(comment, name), name)
+        entries, notes = _read_csv(content, header, crs_of_comment(comment), name)
     else:
         entries, notes = _read_geo(content, name), []
     seen: dict[str, int] = {}
@@ -120,15 +124,15 @@ def _with_convention(entries: list[Geotag], notes: list[str], name: str) -> Geot
     return Geotags(entries=tuple(entries), is_nadir_zero=is_nadir_zero, notes=tuple(notes))
 
 
-def _read_geo(content: list[tuple[int, str]], name: str) -> list[Geotag]:
-    crs, kind = _crs(content[0][1], f"{name} line {content[0][0]}")
+def _read_geo(content: list[Line], name: str) -> list[Geotag]:
+    crs, kind = read_crs(content[0][1], f"{name} line {content[0][0]}")
     entries = []
     for line, words in content[1:]:
         cells = words.split("\t") if words.count("\t") >= 2 else words.split()
         where = f"{name} line {line}"
         if len(cells) < 3:
             raise JaxbaError(f"{where}: '{words}' has {len(cells)} columns; give image x y, then z and more if known.")
-        x, y = (_number(cells[k], where, "xy"[k - 1]) for k in (1, 2))
+        x, y = (read_number(cells[k], where, "xy"[k - 1]) for k in (1, 2))
         # what follows a full set of columns is a label; a set that is not full must not be taken for one
         count = max(k for k in (3, 4, 7, 9) if k <= len(cells))
         if len(cells) not in (3, 4, 7, 9) and len(cells) < 9:
@@ -137,23 +141,16 @@ def _read_geo(content: list[tuple[int, str]], name: str) -> list[Geotag]:
                 "horizontal and vertical accuracy)."
             )
         names = ("z", "yaw", "pitch", "roll", "horizontal accuracy", "vertical accuracy")[: count - 3]
-        numbers = [_number(cells[3 + k], where, label) for k, label in enumerate(names)]
+        numbers = [read_number(cells[3 + k], where, label) for k, label in enumerate(names)]
         numbers += [None] * (6 - len(numbers))
         entries.append(_entry(cells[0], line, where, crs, kind, x, y, numbers[0], numbers[1:4], numbers[4:6]))
     return entries
 
 
 def _read_csv(
-    content: list[tuple[int, str]], header: list[str], comment_crs: str | None, name: str
+    content: list[Line], header: list[str], comment_crs: str | None, name: str
 ) -> tuple[list[Geotag], list[str]]:
-    place: dict[str, int] = {}
-    unused = []
-    for index, title in enumerate(header):
-        column = next((column for column, names in _COLUMNS.items() if _plain(title) in names), None)
-        if column is None or column in place:
-            unused.append(title)
-        else:
-            place[column] = index
+    place, unused = columns_by_name(header, _COLUMNS)
     notes = [f"{name}: columns that are not used: {', '.join(unused)}."] if any(unused) else []
     is_geographic = "latitude" in place and "longitude" in place
     if not is_geographic and not ("x" in place and "y" in place):
@@ -165,18 +162,15 @@ def _read_csv(
         raise JaxbaError(f"{name}: x and y need a CRS; add a crs column, or a first line such as '# EPSG:32615'.")
     known: dict[str, tuple[str, HeightKind]] = {}
     entries = []
-    for line, cells in _rows(content[1:], header, name):
+    for line, cell in csv_rows(content[1:], header, place, name):
         where = f"{name} line {line}"
 
-        def cell(column: str, cells: list[str] = cells) -> str:
-            return cells[place[column]].strip() if column in place else ""
-
         def value(column: str, where: str = where, cell=cell) -> float | None:
-            return _number(cell(column), where, column) if cell(column) else None
+            return read_number(cell(column), where, column) if cell(column) else None
 
         text = cell("crs") or comment_crs or ("EPSG:4326" if is_geographic else "")
         if text not in known:
-            known[text] = _crs(f"EPSG:{text}" if text.isdigit() else text, where)
+            known[text] = read_crs(text, where)
         crs, kind = known[text]
         x, y = (value("longitude"), value("latitude")) if is_geographic else (value("x"), value("y"))
         if not cell("name") or x is None or y is None:
@@ -202,10 +196,7 @@ def _entry(
     angles: list[float | None],
     accuracies: list[float | None],
 ) -> Geotag:
-    if crs in ("EPSG:4326", "EPSG:4979"):
-        for label, value, limit in (("longitude", x, 180), ("latitude", y, 90)):
-            if abs(value) > limit:
-                raise JaxbaError(f"{where}: {label} {value:g} is out of range; x is the longitude, y the latitude.")
+    refuse_degrees_out_of_range(crs, x, y, where)
     for label, value in zip(("horizontal", "vertical"), accuracies, strict=True):
         if value is not None and value < 0:
             raise JaxbaError(f"{where}: {label} accuracy {value:g} is negative; give a sigma in metres, 0 if unknown.")
@@ -226,78 +217,3 @@ def _entry(
         ),
         yaw_pitch_roll_deg=(known[0], known[1], known[2]) if is_known else None,
     )
-
-
-def _rows(content: list[tuple[int, str]], header: list[str], name: str) -> Iterator[tuple[int, list[str]]]:
-    separator = _separator(header, content)
-    for line, words in content:
-        cells = next(csv.reader(io.StringIO(words), delimiter=separator), [])
-        if len(cells) != len(header):
-            raise JaxbaError(
-                f"{name} line {line}: has {len(cells)} columns where the header has {len(header)}; mend it."
-            )
-        yield line, cells
-
-
-def _separator(header: list[str], content: list[tuple[int, str]]) -> str:
-    """Return the separator that cuts the first row into as many cells as the header has."""
-    fits = [s for s in ",;\t" if content and len(next(csv.reader([content[0][1]], delimiter=s))) == len(header)]
-    return fits[0] if fits else ","
-
-
-def _split(line: str) -> list[str] | None:
-    """Return the titles of a CSV's header line; None for what is none."""
-    for separator in ",;\t":
-        cells = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
-        if len(cells) >= 3 and any(_plain(cell) in _COLUMNS["name"] for cell in cells):
-            return cells
-    return None
-
-
-def _plain(title: str) -> str:
-    """Return a column's title without case, units in brackets and punctuation."""
-    bare = re.sub(r"[\[(].*?[\])]", "", title.lower())
-    return re.sub(r"[^a-z0-9]+", "_", bare).strip("_")
-
-
-def _crs_of_comment(comment: str, name: str) -> str | None:
-    text = re.sub(r"^(crs|srs|epsg)\s*[:=]\s*", "", comment, flags=re.IGNORECASE)
-    if text.isdigit():
-        return f"EPSG:{text}"
-    return text if re.match(r"(EPSG:|\+proj|WGS)", text, re.IGNORECASE) else None
-
-
-def _crs(text: str, where: str) -> tuple[str, HeightKind]:
-    """Return a CRS as a text that pyproj reads, and what its heights are above."""
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
-    if match := _UTM.fullmatch(text):
-        zone, side = int(match[1]), match[2].upper()
-        if not 1 <= zone <= 60:
-            raise JaxbaError(f"{where}: UTM zone {zone} does not exist; give one from 1 to 60.")
-        return f"EPSG:{(32600 if side == 'N' else 32700) + zone}", "unknown"
-    text = text.upper() if text.lower().startswith("epsg:") else text
-    try:
-        crs = CRS.from_user_input(text)
-    except CRSError:
-        raise JaxbaError(
-            f"{where}: '{text}' is no CRS; give EPSG:4326, a PROJ string, or 'WGS84 UTM 17N' (a geo.txt has it on its "
-            "first line, a CSV a header with the columns' names)."
-        ) from None
-    if crs.is_compound:
-        vertical = crs.sub_crs_list[-1].name.lower()
-        return text, "ellipsoidal" if "ellipsoid" in vertical else "mean_sea_level"
-    return text, "ellipsoidal" if len(crs.axis_info) == 3 and crs.is_geographic else "unknown"
-
-
-def _number(text: str, where: str, label: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise JaxbaError(
-            f"{where}: {label} '{text}' is no number; write it with a point, without unit or thousands marks."
-        )
-    return value

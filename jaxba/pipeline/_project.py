@@ -17,6 +17,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._store import cannot_write, remove_leftovers, sha256
@@ -25,15 +26,21 @@ from jaxba.scene import PhotoFile
 SETTINGS, SUMMARY = "jaxba.toml", "summary.json"
 _RUN, _PHOTOS = "run.json", "photos.json"
 _GEOTAGS = "geo.txt"
+_LISTS = ("geotags", "gcp", "check")
 _LONGEST_NAME = 180  # bytes of a folder's name, which mostly may have 255
 
 
 @dataclass(frozen=True, kw_only=True)
 class Given:
-    """What a run was given beside its parameters: the folder of photos, and a list that replaces their tags."""
+    """What a run was given beside its parameters: the folder of photos, and lists.
+
+    - `geotags`: replaces the photos' tags. `gcp`, `check`: surveyed points and their marks.
+    """
 
     photos: Path
     geotags: Path | None = None
+    gcp: Path | None = None
+    check: Path | None = None
 
 
 class Project:
@@ -82,9 +89,8 @@ class Project:
         content = self.read_json(_RUN)
         if not isinstance(content, dict) or "stage" not in content:
             raise JaxbaError(f"{self.folder / _RUN}: is damaged; run again.")
-        geotags = content["geotags"]
-        given = Given(photos=Path(content["photos"]), geotags=None if geotags is None else Path(geotags))
-        return given, content["stage"]
+        paths = {name: None if (text := content[name]) is None else Path(text) for name in _LISTS}
+        return Given(photos=Path(content["photos"]), **paths), content["stage"]
 
     def write_json(self, name: str, content: object) -> None:
         """Write a JSON file of the project, whole or not at all, where it changes."""
@@ -138,17 +144,28 @@ class Project:
         return tuple(found)
 
 
-def read_geotags(photos: Path, given: Path | None) -> tuple[str, str] | None:
-    """Return name and text of the list that replaces the tags: the given one, or `geo.txt` among the photos."""
-    path = given or photos / _GEOTAGS
+def read_lists(given: Given) -> dict[str, Any]:
+    """Return name and text of the lists, as `Done` takes them; `geo.txt` among the photos is one of tags."""
+    geotags = given.geotags
+    if geotags is None and (given.photos / _GEOTAGS).is_file():
+        geotags = given.photos / _GEOTAGS
+    return {
+        "geotags": _read_list(geotags, "a geo.txt or CSV"),
+        "gcp": _read_list(given.gcp, "a gcp_list.txt or CSV"),
+        "check": _read_list(given.check, "a gcp_list.txt or CSV"),
+    }
+
+
+def _read_list(path: Path | None, kind: str) -> tuple[str, str] | None:
+    """Return name and text of a list; None where none is given. `kind`: what it is to be, for messages."""
+    if path is None:
+        return None
     if not path.is_file():
-        if given is None:
-            return None
-        raise JaxbaError(f"{path}: there is no such file; give a geo.txt or CSV.")
+        raise JaxbaError(f"{path}: there is no such file; give {kind}.")
     try:
         return str(path.name), path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise JaxbaError(f"{path}: cannot be read as text ({error}); give a geo.txt or CSV in UTF-8.") from error
+        raise JaxbaError(f"{path}: cannot be read as text ({error}); give {kind} in UTF-8.") from error
 
 
 def _files_below(photos: Path, project: Path) -> list[tuple[str, Path]]:

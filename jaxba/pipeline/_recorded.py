@@ -5,7 +5,7 @@ from pathlib import Path
 
 from jaxba.pipeline import _store
 from jaxba.pipeline._lock import holder
-from jaxba.pipeline._project import SETTINGS, SUMMARY, Project
+from jaxba.pipeline._project import SETTINGS, SUMMARY, Project, read_lists
 from jaxba.pipeline._settings import default_settings, from_toml
 from jaxba.pipeline._stages import STAGES, Done
 from jaxba.pipeline._work import collected, works
@@ -36,13 +36,13 @@ def recorded(folder: Path) -> Recorded:
 
     Records of earlier runs, made from other inputs or parameters, are passed over, and all that would follow them.
 
-    Raises `JaxbaError` where the folder is no project.
+    Raises `JaxbaError` where the folder is no project, or a list that the run was given cannot be read any more.
     """
     project = Project(folder, make=False)
     settings = from_toml(project.folder / SETTINGS, default_settings())
-    _, stage_now = project.read_given()
+    given, stage_now = project.read_given()
     running = holder(project.folder)
-    done = Done(files=(), settings=settings)
+    done = Done(files=(), settings=settings, **read_lists(given))
     failed: dict[str, tuple[Left, ...]] = {}
     stale = None
     for stage in STAGES:

@@ -20,7 +20,7 @@ from jaxba.pipeline._limits import check_failures, check_store
 from jaxba.pipeline._lock import locked
 from jaxba.pipeline._parameters import Parameters
 from jaxba.pipeline._pool import Item, fewer_workers, work as work_on
-from jaxba.pipeline._project import SETTINGS, SUMMARY, Given, Project, read_geotags
+from jaxba.pipeline._project import SETTINGS, SUMMARY, Given, Project, read_lists
 from jaxba.pipeline._settings import Settings, to_toml
 from jaxba.pipeline._stages import NAMES, STAGES, Done, Stage, run_photo
 from jaxba.pipeline._summary import left_out, stage_lines, summary
@@ -36,12 +36,15 @@ def run_pipeline(
     *,
     until: str | None = None,
     geotags: Path | None = None,
+    gcp: Path | None = None,
+    check: Path | None = None,
     resources: Resources | None = None,
     tell: Callable[[Event], None] = lambda event: None,
 ) -> Run:
     """Run the pipeline on a folder of photos, up to and with the stage `until`; what is unchanged is not run again.
 
     - `out`: the project folder. `settings`: parameters by stage. `geotags`: a list that replaces the photos' tags.
+    - `gcp`, `check`: lists of control and of check points.
 
     Raises `JaxbaError` where the photos, the parameters or the folder make a result impossible, and where another run
     works on the project; the stages before it are kept.
@@ -51,8 +54,8 @@ def run_pipeline(
     project = Project(out)
     with locked(project.folder):
         project.remove_leftovers()
-        given = Given(photos=photos, geotags=geotags)
-        done = Done(files=project.photo_files(photos), settings=settings, geotags=read_geotags(photos, geotags))
+        given = Given(photos=photos, geotags=geotags, gcp=gcp, check=check)
+        done = Done(files=project.photo_files(photos), settings=settings, **read_lists(given))
         project.write_text(SETTINGS, to_toml(settings))
         if resources is None:
             found = settings["workers"]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxba.pipeline import adjust, crs, export, features, match, metadata, pairs, start, tracks
+from jaxba.pipeline import adjust, control, crs, export, features, match, metadata, pairs, start, tracks
 from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
 from jaxba.pipeline._key import Key
@@ -32,8 +32,11 @@ class Done:
     files: tuple[PhotoFile, ...]
     settings: Mapping[str, Any]
     geotags: tuple[str, str] | None = None
+    gcp: tuple[str, str] | None = None
+    check: tuple[str, str] | None = None
     metadata: Any = None
     crs: Any = None
+    control: Any = None
     pairs: Any = None
     features: Any = None
     features_left_out: tuple[Left, ...] = ()
@@ -51,13 +54,13 @@ class Done:
     @property
     def placed(self) -> Reference:
         """The reference without the target CRS: nothing before the export depends on it."""
-        frame = self.crs.reference.frame
+        frame = self.control.reference.frame
         if frame is None:
-            return self.crs.reference
+            return self.control.reference
         frame = dataclasses.replace(
             frame, crs="", epsg=None, crs_name="", unit="", height_note="", height_datum="", height_unit=""
         )
-        return dataclasses.replace(self.crs.reference, frame=frame, review=(), notes=())
+        return dataclasses.replace(self.control.reference, frame=frame, review=(), notes=())
 
     @property
     def routing(self) -> Routing:
@@ -110,6 +113,11 @@ def _metadata(done: Done) -> metadata.Inputs:
 
 def _crs(done: Done) -> crs.Inputs:
     return crs.Inputs(photos=done.photos)
+
+
+def _control(done: Done) -> control.Inputs:
+    made, lists = done.crs, {"gcp": done.gcp, "check": done.check}
+    return control.Inputs(photos=done.photos, reference=made.reference, target_crs=made.target_crs, **lists)
 
 
 def _pairs(done: Done) -> pairs.Inputs:
@@ -244,12 +252,13 @@ def _adjust(done: Done) -> adjust.Inputs:
 
 
 def _export(done: Done) -> export.Inputs:
-    return export.Inputs(photos=done.photos, reference=done.crs.reference, adjusted=done.adjust)
+    return export.Inputs(photos=done.photos, reference=done.control.reference, adjusted=done.adjust)
 
 
 STAGES = (
     Stage(metadata, _metadata),
     Stage(crs, _crs),
+    Stage(control, _control),
     Stage(pairs, _pairs),
     Stage(features, _features, _features_collected, _without_keypoints),
     Stage(match, _match, _match_collected),

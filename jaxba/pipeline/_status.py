@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._lock import holder
-from jaxba.pipeline._project import SETTINGS, SUMMARY, Given, Project, read_geotags
+from jaxba.pipeline._project import SETTINGS, SUMMARY, Given, Project, read_lists
 from jaxba.pipeline._settings import Settings, default_settings, from_toml
 from jaxba.pipeline._stages import STAGES, Done, Stage
 from jaxba.pipeline._summary import left_out
@@ -71,7 +71,7 @@ def status(folder: Path, settings: Settings) -> Status:
     stages: list[Standing] = []
     try:
         files = project.photo_files(given.photos, remember=False)
-        done = Done(files=files, settings=settings, geotags=read_geotags(given.photos, given.geotags))
+        done = Done(files=files, settings=settings, **read_lists(given))
     except JaxbaError as error:
         stages.append(Standing(stage=STAGES[0].name, state="stale", num_all=1, reason=str(error)))
     for stage in STAGES[len(stages) :]:

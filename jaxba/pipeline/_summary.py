@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxba.pipeline._control_summary import control_lines
 from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._pair_record import pair_facts, pair_lines
@@ -32,6 +33,8 @@ def stage_lines(event: Event) -> list[str]:
         where = reference.frame.crs_name if reference.frame is not None else "no place on earth"
         first = f"{where}; {int(reference.is_used.sum())} of {len(reference.is_used)} positions used"
         notes = [*reference.notes, *_grouped(reference.review)]
+    elif event.stage == "control":
+        first, notes = control_lines(outputs)
     elif event.stage == "features":
         found = {index: outputs[index] for index in sorted(outputs)}
         counts = [features.num_keypoints for features in found.values()]
@@ -83,7 +86,7 @@ def summary(run: Run) -> dict[str, Any]:
         facts["stopped"] = {"stage": run.stopped.name, "reason": run.stopped.reason}
     facts["stages"] = {stage: list(lines) for stage, lines in run.lines.items()}
     if done.crs is not None:
-        reference = done.crs.reference
+        reference = (done.control or done.crs).reference
         frame = reference.frame
         facts["crs"] = {
             "name": None if frame is None else frame.crs_name,

@@ -49,9 +49,10 @@ class Params(Parameters):
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """- `reference`: positions and attitudes in the local frame, a row a photo."""
+    """- `reference`: positions and attitudes in the local frame, a row a photo. `target_crs`: as it was asked for."""
 
     reference: Reference
+    target_crs: str | None = None
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
@@ -64,7 +65,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
 
     photos = inputs.photos
     if all(photo.position is None for photo in photos):
-        return Outputs(reference=_without_positions(photos, params))
+        return Outputs(reference=_without_positions(photos, params), target_crs=params.target_crs)
     measured = geo.measured_positions(
         photos, height_datum=params.height_datum, std_h_m=params.std_h, std_v_m=params.std_v
     )
@@ -115,7 +116,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
             *attitude_notes,
         ),
     )
-    return Outputs(reference=reference)
+    return Outputs(reference=reference, target_crs=params.target_crs)
 
 
 def _stop_if_too_few(is_used: np.ndarray, counts: dict[str, int], review: tuple[Left, ...], params: Params) -> None:
@@ -135,7 +136,10 @@ def _stop_if_too_few(is_used: np.ndarray, counts: dict[str, int], review: tuple[
 def _without_positions(photos: tuple[Photo, ...], params: Params) -> Reference:
     """Return the reference of photos of which none has a position: attitudes have no frame either."""
     count = len(photos)
-    notes = ["No photo has a position: the block is adjusted without a place on earth; its scale and axes are free."]
+    notes = [
+        "No photo has a position: without control points the block is adjusted without a place on earth, its scale and "
+        "axes free."
+    ]
     if params.target_crs is not None:
         from jaxba import geo
 

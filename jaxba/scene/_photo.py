@@ -56,6 +56,7 @@ class Photo:
     """A usable frame.
 
     - `width_px`, `height_px`: of the stored pixel grid, read from the image itself and not from its tags.
+    - `original_size_px`: width and height that EXIF states, from before a resize; None where it states none.
     - `orientation`: EXIF's, 1 to 8; recorded, not applied.
     - `camera`: photos with the same text share one camera's intrinsics.
     - `focal_px`: for this pixel grid. `focal_source`: how it was found; both None where nothing tells it.
@@ -79,6 +80,7 @@ class Photo:
     attitude: Attitude | None = None
     flight_attitude: Attitude | None = None
     notes: tuple[str, ...] = ()
+    original_size_px: tuple[int, int] | None = None
 
     @property
     def megapixels(self) -> float:

@@ -62,7 +62,13 @@ def read_photo(file: PhotoFile, *, focal_px: float | None = None, max_focal_devi
         attitude=attitude,
         flight_attitude=flight_attitude,
         notes=tuple(notes),
+        original_size_px=_original_size(tags),
     )
+
+
+def _original_size(tags: Tags) -> tuple[int, int] | None:
+    size = tags.original_size_px
+    return None if size is None else (round(size[0]), round(size[1]))
 
 
 def _note_size(tags: Tags, notes: list[str]) -> None:

@@ -6,7 +6,11 @@ import pytest
 
 from jaxba import JaxbaError
 from jaxba.pipeline import _project
-from jaxba.pipeline._project import Given, Project, read_geotags
+from jaxba.pipeline._project import Given, Project, read_lists
+
+
+def read_geotags(photos: Path, path: Path | None = None) -> tuple[str, str] | None:
+    return read_lists(Given(photos=photos, geotags=path))["geotags"]
 
 
 @pytest.fixture
@@ -74,10 +78,10 @@ def test_json_is_written_whole_or_not_at_all(tmp_path: Path):
 
 
 def test_geotags_are_those_given_else_geo_txt_among_the_photos(photos: Path, tmp_path: Path):
-    assert read_geotags(photos, None) is None
+    assert read_geotags(photos) is None
     (photos / "geo.txt").write_bytes(b"\xef\xbb\xbfEPSG:4326\n")
     (tmp_path / "other.csv").write_text("EPSG:32615\n")
-    assert read_geotags(photos, None) == ("geo.txt", "EPSG:4326\n")
+    assert read_geotags(photos) == ("geo.txt", "EPSG:4326\n")
     assert read_geotags(photos, tmp_path / "other.csv") == ("other.csv", "EPSG:32615\n")
     (tmp_path / "latin.csv").write_bytes("Höhe".encode("latin-1"))
     with pytest.raises(JaxbaError, match=r"latin\.csv: cannot be read as text .* in UTF-8"):

@@ -1,0 +1,214 @@
+"""Surveyed points on WGS 84 in whatever CRS each was given, with heights above the surface that a frame's are above.
+
+The list's CRS says what its heights are above where it has a vertical part; else they are declared, or taken for the
+same as the photos', which is said. Heights above two surfaces are turned into each other or refused, never mixed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from pyproj import CRS, Transformer
+from pyproj.enums import TransformDirection
+
+from jaxba._errors import JaxbaError
+from jaxba.geo._crs import authority_code, describe, horizontal_part, parse_crs, refuse_wrong_place, utm_zone
+from jaxba.geo._heights import KINDS, height_step, vertical_crs
+from jaxba.geo._positions import to_wgs84
+
+AS_PHOTOS = "as_photos"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surveyed:
+    """Points on WGS 84, one row a point.
+
+    - `height_m`: metres above `height_datum`, see `LocalFrame`; NaN where none was measured.
+    - `declared`: who says what heights are above. `crs`: of the first point, named by code where it has one.
+    - `notes`: what was found and decided.
+    """
+
+    longitude_deg: Float[np.ndarray, " points"]
+    latitude_deg: Float[np.ndarray, " points"]
+    height_m: Float[np.ndarray, " points"]
+    height_datum: str
+    declared: str
+    crs: str
+    notes: tuple[str, ...]
+
+
+def surveyed_points(
+    crs: Sequence[str],
+    xyz: Float[np.ndarray, "points 3"],
+    *,
+    name: str,
+    height_datum: str = AS_PHOTOS,
+    photos_datum: str | None = None,
+) -> Surveyed:
+    """Return surveyed points on WGS 84; each CRS must hold its points.
+
+    - `crs`: of each point. `xyz`: east or longitude first; z NaN where none was measured. `name`: of the list.
+    - `height_datum`: what heights are above where the CRS does not say so; `as_photos`: the same as the photos'.
+    - `photos_datum`: None where no photo has a height.
+
+    Raises `JaxbaError` for a CRS that is unknown or does not hold the points, and for heights above several surfaces.
+
+    >>> found = surveyed_points(["EPSG:32615"], np.array([[576308.6, 5183424.7, 198.0]]), name="gcp_list.txt")
+    >>> [round(float(value), 4) for value in (*found.longitude_deg, *found.latitude_deg)], found.height_datum
+    ([-92.0, 46.8], 'unknown')
+    """
+    if height_datum != AS_PHOTOS:
+        vertical_crs(height_datum, "control.height_datum")
+    lon, lat, height = np.full(len(xyz), np.nan), np.full(len(xyz), np.nan), np.full(len(xyz), np.nan)
+    notes: list[str] = []
+    stated: dict[str, str] = {}
+    for text in sorted(set(crs)):
+        rows = np.array([k for k, own in enumerate(crs) if own == text])
+        label = f"{name}: CRS"
+        lon[rows], lat[rows], found = to_wgs84(text, xyz[rows, 0], xyz[rows, 1], label, "control")
+        notes += found
+        parsed = parse_crs(text, label)
+        _refuse_elsewhere(parsed, lon[rows], lat[rows], xyz[rows], name)
+        unit, unit_m, own = _vertical(parsed)
+        height[rows] = unit_m * xyz[rows, 2]
+        if own is not None and np.isfinite(height[rows]).any():
+            stated[own] = text
+        if unit_m != 1 and own is None and np.isfinite(height[rows]).any():
+            notes.append(f"{name}: {text} does not say the unit of z; it is taken for that of x and y, {unit}.")
+    if len(stated) > 1:
+        both = " and ".join(f"{_above(datum)} ({text})" for datum, text in stated.items())
+        raise JaxbaError(f"{name}: heights are above several surfaces, {both}; give all of them above one.")
+    datum, declared = _datum(stated, height_datum, photos_datum, bool(np.isfinite(height).any()), name, notes)
+    return Surveyed(
+        longitude_deg=lon, latitude_deg=lat, height_m=height, height_datum=datum, declared=declared,
+        crs=_code_of(crs[0], lon, lat) if len(crs) else "", notes=tuple(notes),
+    )  # fmt: skip
+
+
+def heights_above(
+    datum: str,
+    surveyed: Surveyed,
+    name: str,
+) -> tuple[Float[np.ndarray, " points"], list[str]]:
+    """Return the heights of surveyed points above another surface, and notes.
+
+    Raises `JaxbaError` where the way between the two is not known, or its grid is not installed.
+    """
+    own, height_m = surveyed.height_datum, surveyed.height_m
+    known = np.isfinite(height_m)
+    if own == datum or not known.any():
+        return height_m, []
+    differ = f"{name}: heights are above {_above(own)}, and the photos' above {_above(datum)}"
+    for which, parameter in ((own, "control.height_datum"), (datum, "crs.height_datum")):
+        if which in KINDS and which != "ellipsoidal":
+            other = datum if which == own else own
+            raise JaxbaError(
+                f"{differ}: what leads from one to the other is not known. Declare both, with {parameter}={other} if "
+                "that is what they are above, or a vertical CRS such as EPSG:5773; or leave control's heights out with "
+                "control.heights=ignore."
+            )
+    lon, lat = surveyed.longitude_deg, surveyed.latitude_deg
+    place = float(np.median(lon[known])), float(np.median(lat[known])), float(np.median(height_m[known]))
+    target = CRS.from_epsg(4979) if own == "ellipsoidal" else CRS(f"EPSG:4326+{own.partition(':')[2]}")
+    try:
+        step = height_step(target, datum, "as declared", *place)
+    except JaxbaError as error:
+        raise JaxbaError(f"{differ}: {error} Or leave control's heights out with control.heights=ignore.") from error
+    if step.operation is None:
+        return height_m, []
+    z = np.where(known, height_m, 0.0) / step.unit_m
+    turned = step.operation.transformer.transform(lon, lat, z, direction=TransformDirection.INVERSE)[2]
+    turned = np.where(known, turned * step.source_unit_m, np.nan)
+    change = float(np.median(turned[known] - height_m[known]))
+    return turned, [f"{differ}: control's are turned into the photos' by '{step.operation.name}' ({change:+.3f} m)."]
+
+
+def elsewhere(
+    crs: str, xy: Float[np.ndarray, "points 2"]
+) -> list[tuple[str, Float[np.ndarray, " points"], Float[np.ndarray, " points"]]]:
+    """Return where points would lie with usual mistakes undone: axes swapped, a neighbouring UTM zone; in words."""
+    parsed = horizontal_part(parse_crs(crs))
+    found = [("x and y swapped", *_rough(parsed, xy[:, ::-1]))]
+    zone = parsed.utm_zone
+    if zone is not None:
+        number, side = int(zone[:-1]), zone[-1]
+        others = [((number - 2) % 60 + 1, side), (number % 60 + 1, side), (number, "S" if side == "N" else "N")]
+        for other, south in others:
+            code = (32600 if south == "N" else 32700) + other
+            found.append((f"UTM zone {other}{south} (EPSG:{code})", *_rough(CRS.from_epsg(code), xy)))
+    return [(words, lon, lat) for words, lon, lat in found if np.isfinite(lon).all() and np.isfinite(lat).all()]
+
+
+def _rough(crs: CRS, xy: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return longitude and latitude in the CRS's own datum: within 100 m or so of WGS 84."""
+    if crs.is_geographic:
+        fits = (np.abs(xy) <= [180, 90]).all(axis=1)
+        return np.where(fits, xy[:, 0], np.nan), np.where(fits, xy[:, 1], np.nan)
+    lon, lat = Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True).transform(xy[:, 0], xy[:, 1])
+    return np.where(np.isfinite(lon), lon, np.nan), np.where(np.isfinite(lat), lat, np.nan)
+
+
+def _refuse_elsewhere(
+    crs: CRS, lon: Float[np.ndarray, " n"], lat: Float[np.ndarray, " n"], xyz: Float[np.ndarray, "n 3"], name: str
+) -> None:
+    if not (np.isfinite(lon) & np.isfinite(lat)).all():
+        row = int(np.argmin(np.isfinite(lon) & np.isfinite(lat)))
+        raise JaxbaError(
+            f"{name}: {describe(crs)} has no place with x {xyz[row, 0]:g}, y {xyz[row, 1]:g}; x is the easting or "
+            "longitude. Swap x and y if they are northing and easting, or correct the CRS."
+        )
+    if crs.is_projected:
+        cure = " Swap x and y if they are northing and easting (x is the easting), or correct the CRS of the list."
+        refuse_wrong_place(crs, lon, lat, f"{name}: {describe(crs)}", cure)
+
+
+def _vertical(crs: CRS) -> tuple[str, float, str | None]:
+    """Return the unit of z, its length in metres, and the surface that the CRS says z is above; None if it does not."""
+    if crs.is_compound:
+        vertical = crs.sub_crs_list[-1]
+        axis = vertical.axis_info[0]
+        return axis.unit_name, axis.unit_conversion_factor, authority_code(vertical) or "mean_sea_level"
+    if len(crs.axis_info) == 3:
+        axis = crs.axis_info[2]
+        return axis.unit_name, axis.unit_conversion_factor, "ellipsoidal"
+    if crs.is_projected:
+        return crs.axis_info[0].unit_name, crs.axis_info[0].unit_conversion_factor, None
+    return "metre", 1.0, None
+
+
+def _datum(
+    stated: dict[str, str], asked: str, photos: str | None, has_heights: bool, name: str, notes: list[str]
+) -> tuple[str, str]:
+    """Return what heights are above and who says so; notes are added to."""
+    own = next(iter(stated), None)
+    if not has_heights:
+        return photos or "unknown", "by the photos' tags"
+    if asked != AS_PHOTOS:
+        if own is not None and own != asked:
+            notes.append(f"{name}: heights are declared as above {_above(asked)}, its CRS says {_above(own)}.")
+        return asked, "as declared"
+    if own is not None:
+        return own, f"by the CRS of {name}"
+    if photos is None:
+        notes.append(f"{name} does not say what its heights are above; so do the results (control.height_datum).")
+        return "unknown", f"by {name}"
+    notes.append(
+        f"{name} does not say what its heights are above: they are taken for the same as the photos', above "
+        f"{_above(photos)}. If they are not, declare them with control.height_datum."
+    )
+    return photos, "by the photos' tags"
+
+
+def _above(datum: str) -> str:
+    own = vertical_crs(datum, "height datum")
+    return KINDS[datum] if own is None else f"{own.name} ({datum})"
+
+
+def _code_of(text: str, lon: Float[np.ndarray, " n"], lat: Float[np.ndarray, " n"]) -> str:
+    """Return the code of a CRS: a PROJ string such as that of ODM's lists says the same as a UTM zone's."""
+    crs = parse_crs(text)
+    zone = utm_zone(float(np.median(lon)), float(np.median(lat)))
+    if authority_code(crs) is None and zone.equals(crs, ignore_axis_order=True):
+        return authority_code(zone) or text
+    return authority_code(crs) or text

@@ -1,0 +1,287 @@
+"""Stage control: surveyed points in the local frame, their marks in the photos, which are control and which check.
+
+A point is a check point if any of these says so: it stands in the check list, its role in a CSV is check, or the
+parameter `check` names it. All others are control points. A check point takes no part in anything but the comparison.
+A name may stand in both lists, with the same coordinates; it is a check point then, with the marks of both.
+
+Where no photo has a position, the control points place the local frame, and their CRS is that of the results unless
+another is given. Without a list the reference passes through.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxba._errors import JaxbaError
+from jaxba.io import ControlList, SurveyedPoint, parse_control
+from jaxba.pipeline._marks import marks_in_photos
+from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.scene import Control, Left, LocalFrame, Photo, Reference
+
+_LEAST_FIT = {"helmert": 3, "affine": 4}  # control points that are marked twice
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """- `photos`, `reference`: of the stages before. `target_crs`: that was asked for.
+
+    - `gcp`, `check`: name and text of the lists; None where there is none.
+    """
+
+    photos: tuple[Photo, ...]
+    reference: Reference
+    target_crs: str | None = None
+    gcp: tuple[str, str] | None = None
+    check: tuple[str, str] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Params(Parameters):
+    """What the user may set."""
+
+    method: str = parameter(
+        "adjust",
+        choices=("adjust", "helmert", "affine", "none"),
+        help="control in the adjustment, or a fit of 7 or 12 parameters after it, or only compared",
+    )
+    check: str = parameter("", help="names of points that are check points, such as gcp03, gcp07")
+    std_h: float = parameter(0.02, low=0.001, high=10, help="sigma east and north of a point that states none, metres")
+    std_v: float = parameter(0.03, low=0.001, high=20, help="sigma of its height, metres")
+    mark_std_px: float = parameter(1.0, low=0.05, high=20, help="sigma of a mark an axis, px")
+    mark_width_px: int | None = parameter(
+        None, low=16, high=200_000, help="width of the photos in which marks were set; none: as the files, or EXIF"
+    )
+    heights: str = parameter(
+        "auto", choices=("auto", "use", "ignore"), help="heights of points; auto: not where all of them are 0"
+    )
+    height_datum: str = parameter(
+        "as_photos",
+        help="what heights are above where the list's CRS does not say it: as_photos, ellipsoidal, mean_sea_level, or "
+        "a vertical CRS such as EPSG:5773",
+    )
+    max_distance_km: float = parameter(
+        5.0, low=0.1, high=1000, help="stop where control lies farther from the photos' positions, kilometres"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """- `reference`: with a frame from the control points where the photos have none. `control`: the points.
+
+    - `left_out`: marks and points that cannot be used, with the reason. `notes`: what was found and decided.
+    """
+
+    reference: Reference
+    control: Control
+    left_out: tuple[Left, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def run(inputs: Inputs, params: Params) -> Outputs:
+    """Bring the lists into the local frame.
+
+    Raises `JaxbaError`, which names file and line, for what cannot be read; for a CRS or heights that do not fit the
+    photos; for marks whose scale is not known; and where the method needs more control points.
+    """
+    if inputs.gcp is None and inputs.check is None:
+        return Outputs(reference=inputs.reference, control=Control.nothing())
+    from jaxba import geo  # loads pyproj
+
+    names = " and ".join(entry[0] for entry in (inputs.gcp, inputs.check) if entry is not None)
+    points, notes = _all_points(inputs, params)
+    found = marks_in_photos(points, inputs.photos, params.mark_width_px, names)
+    notes += found.notes
+    xyz = np.array([[point.x, point.y, np.nan if point.z_m is None else point.z_m] for point in points])
+    xyz[:, 2] = _heights(xyz[:, 2], params.heights, names, notes)
+    frame = inputs.reference.frame
+    surveyed = geo.surveyed_points(
+        [point.crs for point in points],
+        xyz,
+        name=names,
+        height_datum=params.height_datum,
+        photos_datum=None if frame is None else frame.height_datum,
+    )
+    notes += surveyed.notes
+    is_check = np.array([point.is_check for point in points])
+    reference = inputs.reference
+    if frame is None:
+        reference = _with_frame(inputs, surveyed, ~is_check, notes)
+        frame = reference.frame
+    elif params.method != "none" and np.isfinite(xyz[~is_check, 2]).any():
+        reference = dataclasses.replace(reference, frame=_with_trusted_heights(frame, geo.UNTRUSTED))
+    if frame is None:
+        nothing = dataclasses.replace(Control.nothing(), method=params.method)
+        return Outputs(reference=reference, control=nothing, left_out=found.left_out, notes=tuple(notes))
+    height_m, told = geo.heights_above(frame.height_datum, surveyed, names)
+    notes += told
+    known = np.isfinite(height_m)
+    std_h, std_v = (
+        np.array([getattr(point, f"std_{axis}_m") or getattr(params, f"std_{axis}") for point in points])
+        for axis in ("h", "v")
+    )
+    xyz_m = geo.local_from_geodetic(
+        frame, surveyed.longitude_deg, surveyed.latitude_deg, np.where(known, height_m, frame.height_m)
+    )
+    _refuse_far(xyz_m, xyz, points, inputs.reference, frame, params, names)
+    control = Control(
+        names=tuple(point.name for point in points),
+        xyz_m=xyz_m,
+        std_m=np.stack([std_h, std_h, np.where(known, std_v, np.inf)], axis=1),
+        is_check=is_check,
+        mark_point=found.point,
+        mark_image=found.image,
+        mark_xy_px=found.xy_px,
+        mark_std_px=params.mark_std_px,
+        method=params.method,
+    )
+    left = [*found.left_out, *_weak(control)]
+    _refuse_too_few(control, params.method, names)
+    return Outputs(reference=reference, control=control, left_out=tuple(left), notes=tuple(notes))
+
+
+def _all_points(inputs: Inputs, params: Params) -> tuple[list[SurveyedPoint], list[str]]:
+    """Return the points of both lists, check points marked as such, and notes."""
+    notes: list[str] = []
+    found: dict[str, SurveyedPoint] = {}
+    for entry, is_check in ((inputs.gcp, False), (inputs.check, True)):
+        if entry is None:
+            continue
+        read: ControlList = parse_control(entry[1], entry[0])
+        notes += read.notes
+        for point in read.points:
+            joined = _joined(found[point.name], point) if point.name in found else point
+            found[point.name] = dataclasses.replace(joined, is_check=joined.is_check or is_check)
+    asked = [name for name in (text.strip() for text in params.check.replace(";", ",").split(",")) if name]
+    unknown = [name for name in asked if name not in found]
+    if unknown:
+        raise JaxbaError(
+            f"control.check={params.check}: no point is called {', '.join(unknown)}; the points are {', '.join(found)}."
+        )
+    return [
+        dataclasses.replace(point, is_check=point.is_check or name in asked) for name, point in found.items()
+    ], notes
+
+
+def _joined(first: SurveyedPoint, second: SurveyedPoint) -> SurveyedPoint:
+    """Return a point of both lists: one place, the marks of both, the same mark once."""
+    for field in ("crs", "x", "y", "z_m"):
+        if getattr(first, field) != getattr(second, field):
+            raise JaxbaError(
+                f"{second.source}: {second.name} has {field} {getattr(second, field)}, and {getattr(first, field)} in "
+                f"{first.source}; give one value, or two names."
+            )
+    known = {(mark.image, mark.x_px, mark.y_px) for mark in first.marks}
+    new = [mark for mark in second.marks if (mark.image, mark.x_px, mark.y_px) not in known]
+    return dataclasses.replace(first, marks=(*first.marks, *new), is_check=first.is_check or second.is_check)
+
+
+def _heights(z: np.ndarray, asked: str, names: str, notes: list[str]) -> np.ndarray:
+    """Return the heights that were measured, NaN for others."""
+    known = np.isfinite(z)
+    if not known.any():
+        notes.append(f"{names} has no heights: control is horizontal only.")
+        return z
+    if asked == "ignore":
+        notes.append(f"{names}: heights are ignored as asked (control.heights=ignore): control is horizontal only.")
+        return np.full(len(z), np.nan)
+    if asked == "auto" and not z[known].any():
+        notes.append(
+            f"{names}: all heights are 0, as in a list without heights: they are taken as not measured, and control is "
+            "horizontal only. If all points do lie at height 0, set control.heights=use."
+        )
+        return np.full(len(z), np.nan)
+    if len(z) > 2 and known.all() and np.ptp(z) == 0:
+        notes.append(
+            f"{names}: all {len(z)} heights are {z[0]:g}. They are used; if they were not measured, set "
+            "control.heights=ignore."
+        )
+    return z
+
+
+def _with_frame(inputs: Inputs, surveyed, is_control: np.ndarray, notes: list[str]) -> Reference:
+    """Return the reference with a frame around the control points."""
+    from jaxba import geo
+
+    if not is_control.any():
+        notes.append("No photo has a position and all points are check points: nothing places the block on earth.")
+        return inputs.reference
+    lon, lat = surveyed.longitude_deg[is_control], surveyed.latitude_deg[is_control]
+    text = inputs.target_crs
+    if text is None:
+        own = geo.parse_crs(surveyed.crs)
+        text = surveyed.crs if own.is_projected or (own.is_compound and own.sub_crs_list[0].is_projected) else None
+    crs = geo.target_crs(text, lon, lat)
+    frame = geo.local_frame(crs, lon, lat, surveyed.height_m[is_control], surveyed.height_datum, surveyed.declared)
+    if np.isnan(surveyed.height_m[is_control]).all():
+        frame = dataclasses.replace(
+            frame,
+            height_note="Heights are metres from a zero of their own: neither photos nor control points have any.",
+        )
+    notes.append("No photo has a position: the control points place the block on earth.")
+    told = geo.frame_notes(frame, is_proposed=False)
+    if inputs.target_crs is None:
+        of = "the CRS of the control points" if text is not None else "proposed, since none was given"
+        told = (told[0].replace("as given", f"{of} (--crs sets another)"), *told[1:])
+    notes += told
+    return dataclasses.replace(inputs.reference, frame=frame)
+
+
+def _with_trusted_heights(frame: LocalFrame, doubt: str) -> LocalFrame:
+    """Return the frame without the doubt that altitudes of the photos cast on heights: control has measured them."""
+    if not frame.height_note.endswith(doubt):
+        return frame
+    note = f"{frame.height_note.removesuffix(doubt).rstrip()} Control points hold them; the GNSS altitudes do not."
+    return dataclasses.replace(frame, height_note=note)
+
+
+def _refuse_far(
+    xyz_m: np.ndarray,
+    given: np.ndarray,
+    points: Sequence[SurveyedPoint],
+    reference: Reference,
+    frame: LocalFrame,
+    params: Params,
+    names: str,
+) -> None:
+    """Refuse control that lies far from the photos, with the usual mistake that brings it there."""
+    from jaxba import geo
+
+    photos = reference.xyz_m[reference.is_used, :2]
+    if not len(photos):
+        return
+    middle = np.median(photos, axis=0)
+    away_km = float(np.hypot(*(np.median(xyz_m[:, :2], axis=0) - middle))) / 1000
+    if away_km <= params.max_distance_km:
+        return
+    tried = ""
+    for words, lon, lat in geo.elsewhere(points[0].crs, given[:, :2]):
+        place = geo.local_from_geodetic(frame, lon, lat, np.full(len(lon), frame.height_m))
+        would_km = float(np.hypot(*(np.median(place[:, :2], axis=0) - middle))) / 1000
+        if would_km <= params.max_distance_km:
+            tried = f" With {words} it would be {would_km:.2f} km: correct the list."
+            break
+    raise JaxbaError(
+        f"{names}: control lies {away_km:,.1f} km from the photos' positions, over {params.max_distance_km:g} km "
+        f"(control.max_distance_km), by {points[0].crs}, the CRS of the list.{tried or ' A wrong zone or datum?'}"
+    )
+
+
+def _weak(control: Control) -> list[Left]:
+    """Return the points that too few photos show."""
+    count = np.bincount(control.mark_point, minlength=control.num_points)
+    return [
+        Left(name=control.names[k], reason=f"is marked in {count[k]} of the photos; two or more fix a point")
+        for k in np.flatnonzero(count < 2)
+    ]
+
+
+def _refuse_too_few(control: Control, method: str, names: str) -> None:
+    count = np.bincount(control.mark_point, minlength=control.num_points)
+    usable = int(np.count_nonzero((count >= 2) & ~control.is_check))
+    if usable < _LEAST_FIT.get(method, 0):
+        raise JaxbaError(
+            f"control.method={method} needs {_LEAST_FIT[method]} control points that two photos or more show, and "
+            f"{names} has {usable}; mark more, or use control.method=adjust."
+        )

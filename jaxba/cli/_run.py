@@ -17,6 +17,7 @@ from jaxba.cli._options import WorkerOptions
 from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Progress, StageLines, steps_told
 from jaxba.cli._text import first_of, many, to_json, wrapped
 from jaxba.pipeline import Event, Run, changed, run_pipeline, summary
+from jaxba.pipeline._control_summary import control_rows
 
 _SUMMARY_LABEL = 12
 
@@ -101,7 +102,7 @@ def _print_summary(result: Run, out: Path) -> None:
     facts = summary(result)
     rows: list[tuple[str, str]] = []
     if "adjust" in facts:
-        rows = _result_rows(facts["adjust"])
+        rows = _result_rows(facts["adjust"], control_rows(facts.get("control")))
     if facts.get("crs", {}).get("name") and "export" in facts:
         code = facts["crs"]["epsg"]
         rows.append(("CRS", facts["crs"]["name"] + (f" (EPSG:{code})" if code else "")))
@@ -119,7 +120,7 @@ def _print_summary(result: Run, out: Path) -> None:
         print(wrapped(label, text, _SUMMARY_LABEL))
 
 
-def _result_rows(adjust: dict[str, Any]) -> list[tuple[str, str]]:
+def _result_rows(adjust: dict[str, Any], control: list[tuple[str, str]]) -> list[tuple[str, str]]:
     rows = [
         ("images", f"{adjust['images']} of {adjust['photos']} adjusted"),
         (
@@ -134,6 +135,7 @@ def _result_rows(adjust: dict[str, Any]) -> list[tuple[str, str]]:
         used = {axis: rms for axis, rms in axes if rms is not None and math.isfinite(rms)}  # heights may not be used
         figures = ", ".join(f"{rms:.2f}" for rms in used.values())
         rows.append(("GNSS fit", f"RMS {figures} m {', '.join(used)} over {adjust['num_gnss']} positions"))
+    rows += control
     for label, finding in zip(["findings"] + [""] * len(adjust["findings"]), adjust["findings"], strict=False):
         rows.append((label, finding))
     return rows

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from jaxba.io._colmap import write_colmap_binary, write_colmap_text
     from jaxba.io._crs import CrsText
     from jaxba.io._csv_cloud import write_csv_cloud
+    from jaxba.io._csv_control import ControlTable, write_csv_control
     from jaxba.io._gcp import ControlList, Mark, SurveyedPoint, parse_control
     from jaxba.io._geopackage import write_geojson, write_geopackage
     from jaxba.io._geotag_match import match_geotags, photo_finder
@@ -29,11 +30,11 @@ if TYPE_CHECKING:
     from jaxba.io._tile import read_tile, write_tile
 
 __all__ = [
-    "SCHEMA", "Cloud", "ColmapModel", "ControlList", "CrsText", "Geotag", "Geotags", "Mark", "Sites", "SurveyedPoint",
-    "make_sites", "match_geotags", "parse_control", "parse_geotags", "photo_finder", "read_bal", "read_colmap_text",
-    "read_problem", "read_tile", "refuse_same_file", "schema_markdown", "what_bal_cannot_hold", "write_atomically",
-    "write_bal", "write_colmap_binary", "write_colmap_text", "write_csv_cloud", "write_geojson", "write_geopackage",
-    "write_las", "write_opensfm", "write_ply", "write_tile",
+    "SCHEMA", "Cloud", "ColmapModel", "ControlList", "ControlTable", "CrsText", "Geotag", "Geotags", "Mark", "Sites",
+    "SurveyedPoint", "make_sites", "match_geotags", "parse_control", "parse_geotags", "photo_finder", "read_bal",
+    "read_colmap_text", "read_problem", "read_tile", "refuse_same_file", "schema_markdown", "what_bal_cannot_hold",
+    "write_atomically", "write_bal", "write_colmap_binary", "write_colmap_text", "write_csv_cloud",
+    "write_csv_control", "write_geojson", "write_geopackage", "write_las", "write_opensfm", "write_ply", "write_tile",
 ]  # fmt: skip
 
 _MODULE_OF = {
@@ -41,6 +42,7 @@ _MODULE_OF = {
     "Cloud": "jaxba.io._cloud",
     "ColmapModel": "jaxba.io._read_colmap",
     "ControlList": "jaxba.io._gcp",
+    "ControlTable": "jaxba.io._csv_control",
     "CrsText": "jaxba.io._crs",
     "Geotag": "jaxba.io._geotags",
     "Geotags": "jaxba.io._geotags",
@@ -62,6 +64,7 @@ _MODULE_OF = {
     "write_colmap_binary": "jaxba.io._colmap",
     "write_colmap_text": "jaxba.io._colmap",
     "write_csv_cloud": "jaxba.io._csv_cloud",
+    "write_csv_control": "jaxba.io._csv_control",
     "write_geojson": "jaxba.io._geopackage",
     "write_geopackage": "jaxba.io._geopackage",
     "write_las": "jaxba.io._las",

@@ -237,6 +237,7 @@ def _start(done: Done) -> start.Inputs:
         reference=done.placed,
         view_graph=done.match.view_graph,
         tracks=done.tracks.tracks,
+        control=done.control.control.without_check_points(),
     )
 
 
@@ -248,11 +249,13 @@ def _adjust(done: Done) -> adjust.Inputs:
         tracks=done.tracks.tracks,
         block=done.start.block,
         features=done.features,
+        control=done.control.control,
     )
 
 
 def _export(done: Done) -> export.Inputs:
-    return export.Inputs(photos=done.photos, reference=done.control.reference, adjusted=done.adjust)
+    made = done.control
+    return export.Inputs(photos=done.photos, reference=made.reference, adjusted=done.adjust, control=made.control)
 
 
 STAGES = (

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxba.pipeline._control_summary import control_lines
+from jaxba.pipeline._control_summary import control_facts, control_lines
 from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._pair_record import pair_facts, pair_lines
@@ -125,6 +125,8 @@ def summary(run: Run) -> dict[str, Any]:
             },
             "findings": list(adjusted.findings),
         }
+    if done.control is not None and done.control.control.num_points:
+        facts["control"] = control_facts(done)
     if done.export is not None:
         facts["export"] = {"files": list(done.export.files), "notes": list(done.export.notes)}
     facts["left_out"] = [

@@ -1,13 +1,14 @@
 """Stage adjust: the bundle adjustment in rounds, with rejection, pruning of edges and triangulation anew."""
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.scene import Block, Features, Left, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Control, ControlFit, Features, Left, Photo, Reference, Tracks, ViewGraph
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,6 +16,7 @@ class Inputs:
     """- `photos`, `reference`, `view_graph`, `tracks`, `block`: of the stages before.
 
     - `features`: of every photo, by its index, to complete tracks from; opened one after the other.
+    - `control`: surveyed points.
     """
 
     photos: tuple[Photo, ...]
@@ -23,6 +25,7 @@ class Inputs:
     tracks: Tracks
     block: Block
     features: Mapping[int, Features] = field(default_factory=dict)
+    control: Control = field(default_factory=Control.nothing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +65,9 @@ class Outputs:
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
     - `pruned`: edges left out, with the reason. `solver`: why the last solve stopped, as `Solution.result` names it.
+    - `gnss_offset_m`: added to measured positions, an axis, where control fixes the block; else 0.
+    - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
+    - `affine`: 3 x 4, what coordinates take beside the block, of `control.method=affine`; else the identity.
     - `findings`: what a surveyor should know, in sentences: ambiguities, contradictions, bounds reached.
     """
 
@@ -84,6 +90,15 @@ class Outputs:
     findings: tuple[str, ...] = ()
     pruned: tuple[Left, ...] = ()
     solver: str = ""
+    gnss_offset_m: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    control: ControlFit = field(default_factory=ControlFit.nothing)
+    mark_used: Bool[np.ndarray, " marks"] = field(default_factory=lambda: np.zeros(0, bool))
+    affine: Float[np.ndarray, "3 4"] = field(default_factory=lambda: np.eye(3, 4))
+
+    @property
+    def gnss_minus_control_m(self) -> Float[np.ndarray, "3"]:
+        """What all GNSS positions are off from control in common; NaN where it is not known."""
+        return self.control.gnss_minus_control_m
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
@@ -91,18 +106,27 @@ def run(inputs: Inputs, params: Params) -> Outputs:
 
     Raises `JaxbaError` where it has fewer than two images, or no point of it is left.
     """
-    from jaxba.sfm import Settings, adjust, findings, gnss_fit, uncertainty  # loads jax, which `--help` must not
+    from jaxba import sfm  # loads jax, which `--help` must not
 
     options = {f.name: getattr(params, f.name) for f in fields(params) if f.name != "min_angle"}
-    settings = Settings(min_angle_rad=float(np.deg2rad(params.min_angle)), **options)
+    settings = sfm.Settings(min_angle_rad=float(np.deg2rad(params.min_angle)), **options)
     reference, photos = inputs.reference, inputs.photos
-    adjusted = adjust(
-        inputs.block, inputs.tracks, inputs.view_graph, reference, photos, settings, inputs.features or None
+    adjusted = sfm.adjust(
+        inputs.block,
+        inputs.tracks,
+        inputs.view_graph,
+        reference,
+        photos,
+        settings,
+        inputs.features or None,
+        inputs.control,
     )
-    sigmas = uncertainty(adjusted, reference)
-    block = adjusted.block
-    fit = gnss_fit(block, reference)
-    found = findings(adjusted, inputs.block, sigmas, fit, reference, photos)
+    sigmas = sfm.uncertainty(adjusted, reference)
+    controlled = sfm.apply_control(adjusted, sigmas, inputs.control, reference)
+    block = controlled.block
+    fit = sfm.gnss_fit(block, reference)
+    found = sfm.findings(dataclasses.replace(adjusted, block=block), inputs.block, sigmas, fit, reference, photos)
+    found = (*sfm.control_findings(adjusted, inputs.control, controlled.fit, reference, photos), *found)
     total = np.bincount(block.observation_point, adjusted.error_px, minlength=block.num_points)
     return Outputs(
         block=block,
@@ -124,4 +148,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         findings=found,
         pruned=adjusted.pruned,
         solver=adjusted.solution.result,
+        gnss_offset_m=adjusted.gnss_offset_m,
+        control=controlled.fit,
+        mark_used=adjusted.mark_used,
+        affine=controlled.affine,
     )

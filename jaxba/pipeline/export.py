@@ -5,7 +5,7 @@ Everything before is computed in the local frame; here each point takes the whol
 
 import dataclasses
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,21 @@ from jaxtyping import Float, Int
 from jaxba.pipeline import adjust
 from jaxba.pipeline._parameters import Parameters
 from jaxba.pipeline._store import sha256
-from jaxba.scene import Block, LocalFrame, Photo, Reference
+from jaxba.scene import Block, Control, LocalFrame, Photo, Reference
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """- `photos`, `reference`, `adjusted`: of the stages before. `folder`: empty; the stage's files go there."""
+    """- `photos`, `reference`, `adjusted`, `control`: of the stages before.
+
+    - `folder`: empty; the stage's files go there.
+    """
 
     photos: tuple[Photo, ...]
     reference: Reference
     adjusted: adjust.Outputs
     folder: Path = Path()
+    control: Control = field(default_factory=Control.nothing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +62,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     crs = None if frame is None else _crs_text(frame)
     photos = [inputs.photos[i] for i in block.image_index]
     cloud = io.Cloud(
-        xyz=_in_crs(frame, block.points_m),
+        xyz=_in_crs(frame, _mapped(inputs, block.points_m)),
         rgb=block.rgb,
         point_id=np.arange(1, block.num_points + 1),
         track_length=np.bincount(block.observation_point, minlength=block.num_points),
@@ -70,6 +74,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     if frame is not None and crs is not None:
         io.write_las(folder / "cloud.laz", cloud, crs)
         _write_sites(inputs, frame, crs)
+        _write_control(inputs, frame)
     _write_colmap(folder / "colmap", block, photos, adjusted.point_error_px, frame, inputs.photos)
     gnss = inputs.reference.xyz_m[block.image_index], inputs.reference.std_m[block.image_index]
     io.write_opensfm(folder / "reconstruction.json", block, photos, frame, *gnss)
@@ -78,6 +83,12 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     _write(folder / "README.txt", _readme(notes).encode())
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return Outputs(files=tuple(files), sha256=tuple(sha256(folder / name) for name in files), notes=tuple(notes))
+
+
+def _mapped(inputs: Inputs, xyz_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return points of the block as `control.method=affine` maps them; as they are with every other method."""
+    affine = inputs.adjusted.affine
+    return xyz_m if np.array_equal(affine, np.eye(3, 4)) else xyz_m @ affine[:, :3].T + affine[:, 3]
 
 
 def _in_crs(frame: LocalFrame | None, xyz_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -111,10 +122,34 @@ def _write_sites(inputs: Inputs, frame: LocalFrame, crs: Any) -> None:
         gnss_residual_m=adjusted.gnss_residual_m,
         error_px=adjusted.error_px,
     )
-    io.write_geopackage(inputs.folder / "cameras.gpkg", sites, _in_crs(frame, sites.xyz_m), crs)
-    geodetic = geo.geodetic_from_local(frame, sites.xyz_m)
+    xyz_m = np.where(sites.is_registered[:, None], _mapped(inputs, sites.xyz_m), sites.xyz_m)
+    io.write_geopackage(inputs.folder / "cameras.gpkg", sites, _in_crs(frame, xyz_m), crs)
+    geodetic = geo.geodetic_from_local(frame, xyz_m)
     heights = f"Heights are in the photos' own height system ({frame.height_datum}), metres."
     io.write_geojson(inputs.folder / "cameras.geojson", sites, geodetic, description=heights)
+
+
+def _write_control(inputs: Inputs, frame: LocalFrame) -> None:
+    """Write the control and check points, where there are any."""
+    from jaxba import io
+
+    control, fit = inputs.control, inputs.adjusted.control
+    if not control.num_points:
+        return
+    known = np.isfinite(control.std_m)
+    table = io.ControlTable(
+        names=control.names,
+        is_check=control.is_check,
+        num_marks=fit.num_marks,
+        surveyed=np.where(known, _in_crs(frame, control.xyz_m), np.nan),
+        adjusted=_in_crs(frame, fit.adjusted_m),
+        residual_m=fit.residual_m,
+        std_m=fit.std_m,
+        mark_rms_px=fit.mark_rms_px,
+        over_sigma=fit.over_sigma,
+        is_suspect=fit.is_suspect,
+    )
+    io.write_csv_control(inputs.folder / "control.csv", table)
 
 
 def _write_colmap(
@@ -149,20 +184,31 @@ def _write_tile(inputs: Inputs) -> list[str]:
     """Write the block as a problem that `jaxba solve` takes; return what it leaves out."""
     from jaxba.ba import PRIORS
     from jaxba.io import write_tile
-    from jaxba.sfm import to_problem
+    from jaxba.sfm import control_part, to_problem, with_offset
 
-    block = inputs.adjusted.block
+    adjusted = inputs.adjusted
+    block = adjusted.block
     problem = to_problem(
         block,
-        inputs.reference,
+        with_offset(inputs.reference, adjusted.gnss_offset_m),
         inputs.photos,
-        std_px=inputs.adjusted.std_px,
-        position_scale=inputs.adjusted.position_scale,
+        std_px=adjusted.std_px,
+        position_scale=adjusted.position_scale,
+        control=control_part(block, inputs.control, adjusted.mark_used),
     )
     known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
     left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]
     write_tile(inputs.folder / "tile.npz", dataclasses.replace(problem, priors=known))
-    return [f"tile.npz leaves out the priors that its format has no arrays for: {', '.join(left)}."] if left else []
+    notes = [f"tile.npz leaves out the priors that its format has no arrays for: {', '.join(left)}."] if left else []
+    if adjusted.gnss_offset_m.any():
+        moved = ", ".join(f"{value:+.3f}" for value in adjusted.gnss_offset_m)
+        notes.append(f"tile.npz holds the measured positions moved by {moved} m (east, north, up), onto control.")
+    if adjusted.control.method in ("helmert", "affine"):
+        notes.append(
+            "tile.npz starts at the block as it was fitted to control afterwards, and holds none: solving it takes the "
+            "block back to what holds it without control."
+        )
+    return notes
 
 
 def _picture(inputs: Inputs, cloud: Any, frame: LocalFrame | None) -> bytes:
@@ -180,7 +226,7 @@ def _picture(inputs: Inputs, cloud: Any, frame: LocalFrame | None) -> bytes:
             xyz=cloud.xyz,
             rgb=cloud.rgb,
             error_px=cloud.error_px,
-            camera_xyz=_in_crs(frame, block.centers_m)[list(order)],
+            camera_xyz=_in_crs(frame, _mapped(inputs, block.centers_m))[list(order)],
             title=f"{block.num_images} of {len(inputs.photos)} photos, {block.num_points:,} points",
             subtitle=figures,
             crs="arbitrary frame and scale" if frame is None else _named(frame),
@@ -211,14 +257,21 @@ def _short(unit: str) -> str:
 
 def _notes(inputs: Inputs, frame: LocalFrame | None) -> list[str]:
     if frame is not None:
-        return [f"Coordinates are in {_named(frame)}, unit {frame.unit}. {frame.height_note}"]
+        notes = [f"Coordinates are in {_named(frame)}, unit {frame.unit}. {frame.height_note}"]
+        if inputs.adjusted.control.method == "affine":
+            notes.append(
+                "The clouds and the cameras' places are mapped by twelve parameters onto control "
+                "(control.method=affine). Poses cannot be: COLMAP's and OpenSfM's models and tile.npz have the "
+                "similarity alone."
+            )
+        return notes
     why = "no photo has a position that can be used"
     if inputs.reference.frame is not None:
-        why = "the block could not be placed by the photos' positions"
+        why = "the block could not be placed by the photos' positions or control points"
     return [
         f"No coordinates on earth: {why}. Clouds and cameras are in a frame and scale of their own, without an EPSG "
         "code; cloud.laz, cameras.gpkg and cameras.geojson, which need a CRS, are left out. "
-        "Give positions with geo.txt."
+        "Give positions with geo.txt, or control points with --gcp."
     ]
 
 
@@ -248,6 +301,7 @@ cameras.gpkg                 the photos' places in the target CRS; registered or
 cameras.geojson              the same, longitude and latitude on WGS 84
 colmap/binary, colmap/text   the model for COLMAP; its world is local, as frame.json beside it says
 reconstruction.json          the model for OpenSfM; its world is the same local one
+control.csv                  control and check points, where a list was given: surveyed, adjusted, residuals, sigmas
 tile.npz                     the adjustment problem: python -m jaxba solve tile.npz
 """
 

@@ -1,21 +1,22 @@
 """Stage start: start values of poses, cameras and points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.scene import Block, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Control, Photo, Reference, Tracks, ViewGraph
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """- `photos`, `reference`, `view_graph`, `tracks`: of the stages before."""
+    """- `photos`, `reference`, `view_graph`, `tracks`: of the stages before. `control`: without check points."""
 
     photos: tuple[Photo, ...]
     reference: Reference
     view_graph: ViewGraph
     tracks: Tracks
+    control: Control = field(default_factory=Control.nothing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +40,7 @@ class Outputs:
 
 def run(inputs: Inputs, params: Params) -> Outputs:
     """Find start values for the largest component."""
-    from jaxba.sfm import initialise  # loads jax, which the table of stages must not
+    from jaxba.sfm import initialise, place_by_control  # loads jax, which the table of stages must not
 
     block = initialise(
         inputs.photos,
@@ -49,4 +50,4 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         camera_model=params.camera_model,
         min_angle_rad=float(np.deg2rad(params.min_angle)),
     )
-    return Outputs(block=block)
+    return Outputs(block=place_by_control(block, inputs.control))

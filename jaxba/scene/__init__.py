@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from jaxba.scene._attitude import Attitude, cam_from_enu
 from jaxba.scene._block import Block
 from jaxba.scene._candidates import joining_pairs, nearest_pairs, window_pairs
-from jaxba.scene._control import Control
+from jaxba.scene._control import Control, ControlFit
 from jaxba.scene._features import Features
 from jaxba.scene._footprint import Footprints, footprint_overlaps, footprint_pairs, ground_footprints
 from jaxba.scene._graph import components
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from jaxba.scene.synthetic import DRONE_CAMERA, Survey, Truth, uav_block
 
 __all__ = [
-    "DRONE_CAMERA", "Attitude", "Block", "Control", "EdgeStatus", "Features", "Footprints", "Left", "LocalFrame",
-    "Photo", "PhotoFile", "Position", "Reference", "Survey", "Tracks", "Truth", "ViewGraph", "build_tracks",
-    "cam_from_enu", "components", "footprint_overlaps", "footprint_pairs", "ground_footprints", "joining_pairs",
-    "nearest_pairs", "uav_block", "window_pairs",
+    "DRONE_CAMERA", "Attitude", "Block", "Control", "ControlFit", "EdgeStatus", "Features", "Footprints", "Left",
+    "LocalFrame", "Photo", "PhotoFile", "Position", "Reference", "Survey", "Tracks", "Truth", "ViewGraph",
+    "build_tracks", "cam_from_enu", "components", "footprint_overlaps", "footprint_pairs", "ground_footprints",
+    "joining_pairs", "nearest_pairs", "uav_block", "window_pairs",
 ]  # fmt: skip
 
 _SYNTHETIC = ("DRONE_CAMERA", "Survey", "Truth", "uav_block")

@@ -1,6 +1,6 @@
 """Control and check points in the local frame, and where photos show them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -41,6 +41,66 @@ class Control:
             mark_xy_px=np.zeros((0, 2)),
         )
 
+    def without_check_points(self) -> "Control":
+        """Return the control points alone."""
+        keep = ~self.is_check
+        number = np.cumsum(keep) - 1
+        marks = keep[self.mark_point]
+        return replace(
+            self,
+            names=tuple(name for name, kept in zip(self.names, keep, strict=True) if kept),
+            xyz_m=self.xyz_m[keep],
+            std_m=self.std_m[keep],
+            is_check=self.is_check[keep],
+            mark_point=number[self.mark_point[marks]],
+            mark_image=self.mark_image[marks],
+            mark_xy_px=self.mark_xy_px[marks],
+        )
+
     @property
     def num_points(self) -> int:
         return len(self.names)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlFit:
+    """How a result fits its surveyed points, one row a point of `Control`; NaN where a point or axis has no answer.
+
+    - `adjusted_m`: the point in the result, local frame. `residual_m`: adjusted minus surveyed, east, north, up.
+    - `std_m`: predicted sigma of the adjusted point. `num_marks`: used. `mark_rms_px`: of their errors.
+    - `over_sigma`: the largest of the three differences between point and survey over its predicted sigma.
+    - `is_suspect`: over the limit of the blunder test.
+    - `method`: by which control was used; `none` where it could not be.
+    - `control_rms_m`, `check_rms_m`: an axis, over all points that have a residual in it.
+    - `gnss_minus_control_m`: what all GNSS positions are off in common, where control fixes the block.
+    """
+
+    adjusted_m: Float[np.ndarray, "points 3"]
+    residual_m: Float[np.ndarray, "points 3"]
+    std_m: Float[np.ndarray, "points 3"]
+    num_marks: Int[np.ndarray, " points"]
+    mark_rms_px: Float[np.ndarray, " points"]
+    over_sigma: Float[np.ndarray, " points"]
+    is_suspect: Bool[np.ndarray, " points"]
+    method: str
+    control_rms_m: Float[np.ndarray, "3"]
+    check_rms_m: Float[np.ndarray, "3"]
+    gnss_minus_control_m: Float[np.ndarray, "3"]
+
+    @staticmethod
+    def nothing(num_points: int = 0) -> "ControlFit":
+        """Return a fit of points that the result says nothing of."""
+        unknown = np.full((num_points, 3), np.nan)
+        return ControlFit(
+            adjusted_m=unknown,
+            residual_m=unknown,
+            std_m=unknown,
+            num_marks=np.zeros(num_points, np.int64),
+            mark_rms_px=np.full(num_points, np.nan),
+            over_sigma=np.full(num_points, np.nan),
+            is_suspect=np.zeros(num_points, bool),
+            method="none",
+            control_rms_m=np.full(3, np.nan),
+            check_rms_m=np.full(3, np.nan),
+            gnss_minus_control_m=np.full(3, np.nan),
+        )

@@ -2,6 +2,10 @@
 
 from jaxba.sfm._adjust import Adjusted, adjust
 from jaxba.sfm._bounds import AtBound, intrinsics_at_bounds
+from jaxba.sfm._control import agreeing_marks, control_part, with_offset
+from jaxba.sfm._control_findings import control_findings
+from jaxba.sfm._control_fit import Controlled, apply_affine, apply_control
+from jaxba.sfm._control_start import place_by_control
 from jaxba.sfm._findings import GnssFit, findings, gnss_fit, height_above_ground
 from jaxba.sfm._initialise import initialise
 from jaxba.sfm._points import with_points
@@ -10,6 +14,8 @@ from jaxba.sfm._settings import Settings
 from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [
-    "Adjusted", "AtBound", "GnssFit", "Settings", "Uncertainty", "adjust", "findings", "free_parameters", "gnss_fit",
-    "height_above_ground", "initialise", "intrinsics_at_bounds", "to_problem", "uncertainty", "with_points",
+    "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Uncertainty", "adjust", "agreeing_marks",
+    "apply_affine", "apply_control", "control_findings", "control_part", "findings", "free_parameters", "gnss_fit",
+    "height_above_ground", "initialise", "intrinsics_at_bounds", "place_by_control", "to_problem", "uncertainty",
+    "with_offset", "with_points",
 ]  # fmt: skip

@@ -22,8 +22,9 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import Problem, Solution, make_plan, reprojection_errors, solve
 from jaxba.ba._plan import Shape
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
-from jaxba.scene import Block, Features, Left, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Control, Features, Left, Photo, Reference, Tracks, ViewGraph
 from jaxba.sfm._complete import complete_tracks
+from jaxba.sfm._control import ControlPart, agreeing_marks, control_part, gnss_offset, with_offset
 from jaxba.sfm._edges import edge_medians_px, match_rows, without_edges
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
 from jaxba.sfm._points import apply_points, track_rows, triangulate_tracks
@@ -51,6 +52,8 @@ class Adjusted:
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions.
     - `num_judged`: observations that were judged by their error; those not in the block were rejected.
     - `medians_px`: of each round's observations after its solve. `converged`: the median no longer changed.
+    - `control`: the control points of the last solve, their start values at its solution. `mark_used`: of all marks,
+      those that agree with the others of their point. `gnss_offset_m`: added to measured positions, an axis.
     - `pruned`: edges left out. `lost`: images that had too few observations left. `notes`: what else was decided.
     """
 
@@ -67,6 +70,9 @@ class Adjusted:
     pruned: tuple[Left, ...]
     lost: tuple[Left, ...]
     notes: tuple[str, ...]
+    mark_used: Bool[np.ndarray, " marks"]
+    gnss_offset_m: Float[np.ndarray, "3"]
+    control: ControlPart | None = None
 
     @property
     def num_rejected(self) -> int:
@@ -81,16 +87,19 @@ def adjust(
     photos: Sequence[Photo],
     settings: Settings,
     features: Mapping[int, Features] | None = None,
+    control: Control | None = None,
 ) -> Adjusted:
     """Return the adjusted block; `block` holds the start values, with points or without.
 
-    `features`: of every image, by index, to complete tracks from; without them tracks stay as they are.
+    - `features`: of every image, by index, to complete tracks from; without them tracks stay as they are.
+    - `control`: surveyed points; its check points take no part.
 
     Raises `JaxbaError` where the block has fewer than two images, or no point of it is left.
     """
     if block.num_images < 2:
         raise JaxbaError(f"The block has {block.num_images} images with start values; an adjustment needs two or more.")
-    rounds = _Rounds(anchor=block, reference=reference, photos=photos, settings=settings)
+    control = Control.nothing() if control is None else control
+    rounds = _Rounds(anchor=block, reference=reference, photos=photos, settings=settings, control=control)
     if not block.num_points:
         limit = 4 * settings.track_threshold
         block = apply_points(block, tracks, triangulate_tracks(block, tracks, settings.min_angle_rad, limit))
@@ -104,13 +113,14 @@ def adjust(
     pruned, lost, notes, medians = [], [], [], []
     std_px, converged, settled, num_judged = 1.0, False, False, block.num_observations
     limit_px, shape = None, rounds.shape(block, tracks)
+    mark_used = np.ones(len(control.mark_point), bool)
     small = free_parameters(block.camera_model, num_images=0)
     every = free_parameters(block.camera_model, num_images=block.num_images)
     while True:
         last = len(medians) + 1 >= settings.max_rounds
         free = every if medians or last else small
         steps = settings.max_nfev if last or settled else _ROUND_STEPS if medians else _FIRST_STEPS
-        solved = rounds.solve(block, std_px, free, shape, max_nfev=min(steps, settings.max_nfev))
+        solved = rounds.solve(block, std_px, free, mark_used, shape, max_nfev=min(steps, settings.max_nfev))
         block = solved.block
         medians.append(float(np.median(solved.error_px)))
         _log.info("round %d, median %.2f px", len(medians), medians[-1])
@@ -118,6 +128,7 @@ def adjust(
         converged = settled and solved.solution.converged
         if converged or last:
             break
+        mark_used = agreeing_marks(block, control)
         found, limit_px = judge(block, tracks, solved.error_px, limit_px, settings)
         if len(medians) > 1:  # what the first round's held intrinsics leave is no edge's fault
             edge_px = edge_medians_px(matches, found, len(view_graph.pairs), tracks.num_observations)
@@ -162,6 +173,9 @@ def adjust(
         pruned=tuple(pruned),
         lost=tuple(lost),
         notes=tuple(notes),
+        mark_used=mark_used,
+        gnss_offset_m=solved.gnss_offset_m,
+        control=solved.control,
     )
 
 
@@ -182,6 +196,8 @@ class _Solved:
     loss: AbstractLoss
     solution: Solution
     position_scale: Float[np.ndarray, "3"]
+    gnss_offset_m: Float[np.ndarray, "3"]
+    control: ControlPart | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,27 +208,41 @@ class _Rounds:
     reference: Reference
     photos: Sequence[Photo]
     settings: Settings
+    control: Control
 
-    def solve(self, block: Block, std_px: float, free: Sequence[str], shape: Shape | None, *, max_nfev: int) -> _Solved:
+    def solve(
+        self,
+        block: Block,
+        std_px: float,
+        free: Sequence[str],
+        mark_used: Bool[np.ndarray, " marks"],
+        shape: Shape | None,
+        *,
+        max_nfev: int,
+    ) -> _Solved:
         """Solve a block; `free` are the camera's parameters that may change, `shape` has the least sizes."""
         settings = self.settings
         model = LOSSES[settings.loss]
         loss = Linear() if model is Linear else model(f_scale=settings.f_scale / std_px)  # type: ignore[call-arg]
         scale = position_scale(block, self.reference)
+        control = control_part(block, self.control, mark_used)
+        offset_m = gnss_offset(block, self.reference, control)
+        reference = with_offset(self.reference, offset_m)
         held = [name for name in CAMERAS[block.camera_model].parameter_names() if name not in free]
 
-        def problem_of(block: Block) -> Problem:
+        def problem_of(block: Block, control: ControlPart | None) -> Problem:
             return to_problem(
                 block,
-                self.reference,
+                reference,
                 self.photos,
                 anchor=self.anchor,
                 std_px=std_px,
                 position_scale=scale,
                 held=held,
+                control=control,
             )
 
-        problem = problem_of(block)
+        problem = problem_of(block, control)
         plan = make_plan(problem, like=shape)
         solution = solve(
             problem,
@@ -222,17 +252,21 @@ class _Rounds:
             ftol=settings.ftol,
             xtol=settings.xtol,
         )
+        num_points, num_own = block.num_points, block.num_observations
         block = with_solution(block, solution)
+        if control is not None:
+            control = dataclasses.replace(control, start_m=np.asarray(solution.points)[num_points:])
         problem = solution.apply(problem)
         error_px = reprojection_errors(problem)
         fits = np.isfinite(error_px)
         if solution.report is not None:
             fits &= ~solution.report.dropped.observations
-        if not fits.all():
-            block = _with_observations(block, fits)
-            problem = problem_of(block)
+        if not fits[:num_own].all():
+            block = _with_observations(block, fits[:num_own])
+            problem = problem_of(block, control)
             error_px = reprojection_errors(problem)
-        return _Solved(block, error_px, problem, loss, solution, scale)
+        error_px = error_px[: block.num_observations]
+        return _Solved(block, error_px, problem, loss, solution, scale, offset_m, control)
 
     def shape(self, block: Block, tracks: Tracks) -> Shape:
         """Return the shape of the block with every observation that may ever join it: all rounds share it."""
@@ -246,7 +280,9 @@ class _Rounds:
             observation_point=of_track,
             observation_xy_px=tracks.xy_px[row],
         )
-        return make_plan(to_problem(full, self.reference, self.photos, anchor=self.anchor), spare=_SPARE).shape
+        control = control_part(block, self.control, np.ones(len(self.control.mark_point), bool))
+        problem = to_problem(full, self.reference, self.photos, anchor=self.anchor, control=control)
+        return make_plan(problem, spare=_SPARE).shape
 
 
 def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:

@@ -36,6 +36,7 @@ _log = logging.getLogger(__name__)
 _MAX_EDGE_ERROR = np.deg2rad(6.0)  # the wrong one of a plane's two poses is off by 10 degrees and more
 _RAY_SCALE = 0.01  # radians: an uncalibrated lens's distortion, seen by rays half way out
 _LEAST_SHARE, _USUAL_SHARE = 0.1, 0.5  # of measurements that fit: real blocks have 0.9 and more, chance gives 0.01
+UNPLACED = "the world is a frame of its own, its unit the median distance from camera to ground."
 _COARSE, _FINE = 0.02, 0.005  # errors, as shares of the longer side, before and after the first rough adjustment
 
 
@@ -190,7 +191,7 @@ def _place(block: Block, reference: Reference, notes: list[str]) -> Block:
         num = np.count_nonzero(reference.is_used[index])
         notes.append(
             f"{num} of {block.num_images} images have a trusted position, too few or too near each other to place the "
-            "block on earth: the world is a frame of its own, its unit the median distance from camera to ground."
+            f"block on earth: {UNPLACED}"
         )
     block = _posed(block, similarity.rotations(rotations), similarity.points(block.centers_m))
     return dataclasses.replace(block, is_georeferenced=placed)

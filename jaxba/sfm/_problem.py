@@ -14,6 +14,8 @@ as fixed ones: so all rounds of an adjustment have one shape and compile once.
 
 **A block without a place on earth** is held by weak priors on all positions at its start values: the seven directions
 that photos cannot fix stay where they were, and nothing else is bent (sigma a tenth of the block's extent).
+
+**Control points** stand behind the block's own points and observations (see `_control.py`).
 """
 
 import dataclasses
@@ -23,11 +25,20 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba import AttitudePrior, IntrinsicsPrior, Observations, PositionPrior, Problem, Solution
+from jaxba.ba import (
+    AttitudePrior,
+    ControlPointPrior,
+    IntrinsicsPrior,
+    Observations,
+    PositionPrior,
+    Problem,
+    Solution,
+)
 from jaxba.ba._problem import AbstractPrior
 from jaxba.geometry import CAMERAS, Cauchy, GemanMcClure, Linear, Pose
 from jaxba.scene import Block, Photo, Reference
 from jaxba.sfm._aspect import AspectPrior
+from jaxba.sfm._control import CONTROL_LOSS, ControlPart
 
 POSITION_LOSS = GemanMcClure(4.0)
 FOCAL_BOUNDS = (0.7, 1.4)
@@ -54,6 +65,7 @@ def to_problem(
     std_px: float = 1.0,
     position_scale: Float[np.ndarray, "3"] | None = None,
     held: Sequence[str] = (),
+    control: ControlPart | None = None,
 ) -> Problem:
     """Return the problem of a block with points, its observations and all priors.
 
@@ -61,6 +73,7 @@ def to_problem(
       where the photos give none; the block itself if None.
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
     - `held`: names of the camera model's parameters that stay as they are.
+    - `control`: points and observations that follow the block's own.
 
     >>> import numpy as np
     >>> from jaxba.sfm import free_parameters
@@ -82,16 +95,24 @@ def to_problem(
         ones = np.ones(len(inside))
         priors.append(AspectPrior(camera_index=cameras, ratio=ones, std=_ASPECT_STD * ones))
     count = block.num_observations
+    points = block.points_m
+    xy_px, std, image, point = (
+        block.observation_xy_px, np.full(count, float(std_px)), block.observation_image, block.observation_point,
+    )  # fmt: skip
+    if control is not None:
+        number = block.num_points + np.arange(len(control.rows))
+        prior = ControlPointPrior(number.astype(np.int32), control.xyz_m, control.std_m, CONTROL_LOSS)
+        priors.append(prior)
+        points = np.concatenate([points, control.start_m])
+        xy_px = np.concatenate([xy_px, control.observation_xy_px])
+        std = np.concatenate([std, np.full(len(control.observation_image), control.std_px)])
+        image = np.concatenate([image, control.observation_image])
+        point = np.concatenate([point, number[control.observation_point]])
     problem = Problem.build(
         Pose(block.quaternion, block.translation_m),
         model.from_parameters(inside),
-        block.points_m,
-        Observations(
-            block.observation_xy_px,
-            np.full(count, float(std_px)),
-            block.observation_image.astype(np.int32),
-            block.observation_point.astype(np.int32),
-        ),
+        points,
+        Observations(xy_px, std, image.astype(np.int32), point.astype(np.int32)),
         camera_index=block.camera_index.astype(np.int32),
         priors=priors,
         image_names=[photos[i].name for i in block.image_index],
@@ -102,14 +123,14 @@ def to_problem(
 
 
 def with_solution(block: Block, solution: Solution) -> Block:
-    """Return the block with the adjusted poses, cameras and points."""
+    """Return the block with the adjusted poses, cameras and points of its own."""
     names = type(solution.cameras).parameter_names()
     return dataclasses.replace(
         block,
         quaternion=np.asarray(solution.poses.quaternion),
         translation_m=np.asarray(solution.poses.translation),
         camera_parameters=np.stack([np.asarray(getattr(solution.cameras, name)) for name in names], axis=1),
-        points_m=np.asarray(solution.points),
+        points_m=np.asarray(solution.points)[: block.num_points],
     )
 
 

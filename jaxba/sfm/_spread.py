@@ -42,7 +42,7 @@ def spread(adjusted: Adjusted) -> float:
 
     `E psi^2` is over the redundancy; psi' is taken at errors as in long tracks. It is 1 at least.
     """
-    block, error = adjusted.block, adjusted.error_px / np.asarray(adjusted.problem.observations.std_px)
+    block, error = adjusted.block, adjusted.error_px / adjusted.std_px
     redundancy = 2 * block.num_observations - 3 * block.num_points - 6 * block.num_images
     if redundancy < _LEAST_REDUNDANCY:
         return 1.0

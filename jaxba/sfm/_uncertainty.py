@@ -42,7 +42,9 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     position, point = np.full((block.num_images, 3), np.nan), np.full((block.num_points, 3), np.nan)
     times = spread(adjusted)
     observations = adjusted.problem.observations
-    observations = dataclasses.replace(observations, std_px=observations.std_px * times)
+    own = adjusted.block.num_observations
+    std_px = np.concatenate([observations.std_px[:own] * times, observations.std_px[own:]])  # those of marks stand
+    observations = dataclasses.replace(observations, std_px=std_px)
     problem = dataclasses.replace(adjusted.problem, observations=observations)
     loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
@@ -53,10 +55,12 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     why_not = None
     if block.is_georeferenced:
         position = _std(found.centers)
-        variance = np.maximum(np.einsum("nii->ni", found.points), 0.0)
+        variance = np.maximum(np.einsum("nii->ni", found.points[: block.num_points]), 0.0)
         point = np.sqrt(with_own_errors(variance, block, adjusted.error_px, times * adjusted.std_px))
         index = block.image_index[used_positions(block, reference)]
         nowhere = ~np.isfinite(reference.std_m[index]).any(axis=0)
+        if adjusted.control is not None:
+            nowhere &= ~adjusted.control.determined
         position[:, nowhere], point[:, nowhere] = np.nan, np.nan
     else:
         why_not = (

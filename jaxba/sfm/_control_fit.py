@@ -1,0 +1,209 @@
+"""How an adjusted block fits its surveyed points, and the fit of 7 or 12 parameters that brings it onto them.
+
+**Residuals** are adjusted minus surveyed, along local east, north, up. A control point in the adjustment is where that
+put it; all others are intersected from their marks by the adjusted poses.
+
+**Blunder test.** A control point intersected from its marks alone is compared with its surveyed coordinates. The
+difference over its sigma (of the survey, of the marks, and of the poses as tie points around show it) is over 3.29 by
+chance in one of a thousand. In a fit, whose parameters a wrong point bends, it is the standardised residual
+`v / sigma_v` with `sigma_v^2` the diagonal of `S - A (A^T S^-1 A)^-1 A^T` (Baarda 1968), over their own scatter where
+that is larger; the point with the largest one is left out and the fit made anew, as long as enough are left.
+
+**Affine.** Twelve parameters near the similarity, each of their nine coefficients held to it with a sigma of 1%: flat
+control tells nothing of how heights are sheared, and that then stays as it is. A camera's pose cannot be sheared, so it
+applies to coordinates alone.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+
+from jaxba.scene import Block, Control, ControlFit, Reference
+from jaxba.sfm._adjust import Adjusted
+from jaxba.sfm._align import Similarity
+from jaxba.sfm._control import LEAST_TO_PLACE, Intersected, intersect, median_offset
+from jaxba.sfm._control_start import determines_tilt, fit_similarity, transformed
+from jaxba.sfm._spread import own_variance
+from jaxba.sfm._uncertainty import Uncertainty
+
+BLUNDER = 3.29  # sigmas: one of a thousand by chance
+LEAST_OF = {"helmert": 3, "affine": 4}
+_SHEAR = 0.01
+_AROUND = 20  # tie points that tell what poses contribute to a point's sigma
+_CHECK_OFF = 5.0  # sigmas: of a check point nobody expects more
+IDENTITY = np.eye(3, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class Controlled:
+    """A block brought onto its control points, as far as the method does so after the adjustment.
+
+    - `affine`: what applies to coordinates beside that, 3 x 4; the identity but for `affine`.
+    """
+
+    block: Block
+    affine: Float[np.ndarray, "3 4"]
+    fit: ControlFit
+
+
+def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, reference: Reference) -> Controlled:
+    """Return the block, fitted to its control points where the method says so, and how it fits them."""
+    block = adjusted.block
+    if not control.num_points or not block.is_georeferenced:
+        return Controlled(block, IDENTITY, ControlFit.nothing(control.num_points))
+    found = intersect(block, control, adjusted.mark_used)
+    variance = _pose_variance(adjusted, sigmas, found) + found.variance_m2
+    method, affine, left_out = "none", IDENTITY, np.zeros(control.num_points, bool)
+    scores = None
+    if control.method == "adjust" and adjusted.control is not None:
+        method = "adjust"
+    use = ~control.is_check & np.isfinite(found.point_m).all(axis=1)
+    if control.method in LEAST_OF and use.sum() >= LEAST_OF[control.method]:
+        method = control.method
+        # what poses have in common is no part of it: the fit takes that up
+        std, variance = np.sqrt(control.std_m**2 + found.variance_m2), found.variance_m2.copy()
+        similarity, scores, left_out = _snooped(found.point_m, control.xyz_m, std, use)
+        block = transformed(block, similarity)
+        found = replace(found, point_m=similarity.points(found.point_m))
+        if method == "affine":
+            affine = fit_affine(*(part[use & ~left_out] for part in (found.point_m, control.xyz_m, std)))
+    points = apply_affine(affine, found.point_m)
+    off = np.where(np.isfinite(control.std_m), points - control.xyz_m, np.nan)
+    std = np.sqrt(np.where(np.isfinite(control.std_m), control.std_m, np.nan) ** 2 + variance)
+    over = _largest(np.abs(off / std))
+    if scores is not None:
+        over = np.where(use, scores, over)
+    if method == "adjust" and adjusted.control is not None:
+        points = points.copy()
+        points[adjusted.control.rows] = adjusted.control.start_m
+        if sigmas.covariance is not None:
+            own = sigmas.covariance.points[block.num_points :]
+            variance[adjusted.control.rows] = np.maximum(np.einsum("nii->ni", own), 0.0)
+    residual = np.where(np.isfinite(control.std_m), points - control.xyz_m, np.nan)
+    with np.errstate(invalid="ignore"):
+        suspect = np.where(control.is_check | (method == "none"), over > _CHECK_OFF, over > BLUNDER) | left_out
+    offset = np.full(3, np.nan)
+    if method != "none":
+        enough = np.isfinite(residual[use]).sum(axis=0) >= LEAST_TO_PLACE
+        offset = np.where(enough, -median_offset(block, reference), np.nan)
+    return Controlled(
+        block,
+        affine,
+        ControlFit(
+            adjusted_m=points,
+            residual_m=residual,
+            std_m=np.sqrt(variance),
+            num_marks=found.num_marks,
+            mark_rms_px=_mark_rms(found, control, adjusted.mark_used),
+            over_sigma=over,
+            is_suspect=suspect,
+            method=method,
+            control_rms_m=_rms(residual[~control.is_check]),
+            check_rms_m=_rms(residual[control.is_check]),
+            gnss_minus_control_m=offset,
+        ),
+    )
+
+
+def apply_affine(affine: Float[np.ndarray, "3 4"], xyz_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return points mapped by a 3 x 4 matrix; the very same ones by the identity."""
+    return xyz_m if np.array_equal(affine, IDENTITY) else xyz_m @ affine[:, :3].T + affine[:, 3]
+
+
+def fit_affine(
+    source: Float[np.ndarray, "n 3"], xyz_m: Float[np.ndarray, "n 3"], std_m: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "3 4"]:
+    """Return the affine map of points onto surveyed ones, near the identity."""
+    middle = source.mean(axis=0)
+    design = np.column_stack([source - middle, np.ones(len(source))])
+    result = np.zeros((3, 4))
+    for axis in range(3):
+        weight = np.where(np.isfinite(std_m[:, axis]), 1 / std_m[:, axis], 0.0)
+        off = np.where(weight > 0, xyz_m[:, axis] - source[:, axis], 0.0)
+        held = np.diag([1 / _SHEAR] * 3 + [1e-6])
+        rows = np.concatenate([design * weight[:, None], held])
+        change = np.linalg.lstsq(rows, np.concatenate([off * weight, np.zeros(4)]), rcond=None)[0]
+        result[axis, :3] = change[:3] + np.eye(3)[axis]
+        result[axis, 3] = change[3] - change[:3] @ middle
+    return result
+
+
+def _snooped(
+    source: Float[np.ndarray, "n 3"],
+    xyz_m: Float[np.ndarray, "n 3"],
+    std_m: Float[np.ndarray, "n 3"],
+    use: Bool[np.ndarray, " n"],
+) -> tuple[Similarity, Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return the similarity onto the points used, without those that fail the blunder test one after the other."""
+    left_out, scores = np.zeros(len(use), bool), np.full(len(use), np.nan)
+    start = Similarity(scale=1.0, rotation=np.eye(3), shift=np.median((xyz_m - source)[use], axis=0))
+    start = fit_similarity(source[use], xyz_m[use], std_m[use], start)
+    while True:
+        rows = np.flatnonzero(use & ~left_out)
+        parts = source[rows], xyz_m[rows], std_m[rows]
+        found = fit_similarity(*parts, start, robust=False)
+        over = _standardised(found, *parts)
+        # a bent block scatters by more than marks and survey alone
+        scores[rows] = _largest(over / max(float(np.nanmedian(over)) / 0.6745, 1.0))
+        worst = rows[np.argmax(np.nan_to_num(scores[rows]))]
+        if not scores[worst] > BLUNDER or len(rows) <= LEAST_TO_PLACE + 1:
+            return found, scores, left_out
+        left_out[worst] = True
+
+
+def _standardised(
+    similarity: Similarity,
+    source: Float[np.ndarray, "n 3"],
+    xyz_m: Float[np.ndarray, "n 3"],
+    std_m: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n 3"]:
+    """Return the standardised residuals, NaN where a coordinate is not known or nothing checks it."""
+    placed = similarity.points(source)
+    arm = placed - placed.mean(axis=0)
+    zero = np.zeros(len(arm))
+    x, y, z = arm.T
+    tilt = determines_tilt(xyz_m, std_m)
+    columns = [[zero, -z, y], [z, zero, -x]] if tilt else []
+    columns += [[-y, x, zero], [x, y, z], *np.eye(3)[:, :, None] * np.ones(len(arm))]
+    weight = np.where(np.isfinite(std_m), 1 / std_m, 0.0)
+    design = np.array(columns).transpose(2, 1, 0) * weight[:, :, None]
+    design = design.reshape(-1, design.shape[2])
+    cofactor = np.linalg.pinv(design.T @ design, hermitian=True)
+    share = (1 - np.einsum("ni,ij,nj->n", design, cofactor, design)).reshape(-1, 3)
+    v = np.where(weight > 0, (placed - xyz_m) * weight, np.nan)
+    return np.abs(v) / np.sqrt(np.where(share > 1e-3, share, np.nan))
+
+
+def _pose_variance(adjusted: Adjusted, sigmas: Uncertainty, found: Intersected) -> Float[np.ndarray, "points 3"]:
+    """Return the part of poses in the variance of points: what tie points around have beyond their own marks'."""
+    block = adjusted.block
+    total = sigmas.point_std_m**2
+    poses = np.maximum(total - own_variance(block, adjusted.std_px), 0.0)
+    known = np.flatnonzero(np.isfinite(total).any(axis=1) & (np.bincount(block.observation_point) >= 3))
+    result = np.zeros(found.point_m.shape)
+    here = np.isfinite(found.point_m).all(axis=1)
+    if len(known) and here.any():
+        near = KDTree(block.points_m[known, :2]).query(found.point_m[here, :2], k=min(_AROUND, len(known)))[1]
+        near = near.reshape(here.sum(), -1)
+        result[here] = np.nan_to_num(np.median(poses[known][near], axis=1))
+    return result
+
+
+def _mark_rms(found: Intersected, control: Control, use: Bool[np.ndarray, " marks"]) -> Float[np.ndarray, " points"]:
+    known = use & np.isfinite(found.error_px)
+    total = np.bincount(control.mark_point[known], found.error_px[known] ** 2, minlength=control.num_points)
+    count = np.bincount(control.mark_point[known], minlength=control.num_points)
+    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+
+
+def _largest(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    known = np.isfinite(rows)
+    return np.where(known.any(axis=1), np.max(np.where(known, rows, -np.inf), axis=1), np.nan)
+
+
+def _rms(residual_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    known = np.isfinite(residual_m)
+    total = np.where(known, residual_m**2, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), np.sqrt(total / np.maximum(known.sum(axis=0), 1)), np.nan)

@@ -191,10 +191,12 @@ def _datum(
     if own is not None:
         return own, f"by the CRS of {name}"
     if photos is None:
-        notes.append(f"{name} does not say what its heights are above; so do the results (control.height_datum).")
+        notes.append(
+            f"{name}: nothing says what heights are above, nor what those of the results are (control.height_datum)."
+        )
         return "unknown", f"by {name}"
     notes.append(
-        f"{name} does not say what its heights are above: they are taken for the same as the photos', above "
+        f"{name}: nothing says what heights are above: they are taken for the same as the photos', above "
         f"{_above(photos)}. If they are not, declare them with control.height_datum."
     )
     return photos, "by the photos' tags"

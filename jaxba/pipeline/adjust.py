@@ -125,7 +125,16 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     controlled = sfm.apply_control(adjusted, sigmas, inputs.control, reference)
     block = controlled.block
     fit = sfm.gnss_fit(block, reference)
-    found = sfm.findings(dataclasses.replace(adjusted, block=block), inputs.block, sigmas, fit, reference, photos)
+    sigmas = controlled.sigmas
+    found = sfm.findings(
+        dataclasses.replace(adjusted, block=block),
+        inputs.block,
+        sigmas,
+        fit,
+        reference,
+        photos,
+        is_controlled=controlled.is_fixed,
+    )
     found = (*sfm.control_findings(adjusted, inputs.control, controlled.fit, reference, photos), *found)
     total = np.bincount(block.observation_point, adjusted.error_px, minlength=block.num_points)
     return Outputs(

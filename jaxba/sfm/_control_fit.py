@@ -40,19 +40,26 @@ IDENTITY = np.eye(3, 4)
 class Controlled:
     """A block brought onto its control points, as far as the method does so after the adjustment.
 
+    - `sigmas`: of the adjustment; without those of positions and points after a fit, which has its own.
     - `affine`: what applies to coordinates beside that, 3 x 4; the identity but for `affine`.
     """
 
     block: Block
+    sigmas: Uncertainty
     affine: Float[np.ndarray, "3 4"]
     fit: ControlFit
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether control points fix the block in all axes."""
+        return self.fit.method != "none" and bool(np.isfinite(self.fit.control_rms_m).all())
 
 
 def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, reference: Reference) -> Controlled:
     """Return the block, fitted to its control points where the method says so, and how it fits them."""
     block = adjusted.block
     if not control.num_points or not block.is_georeferenced:
-        return Controlled(block, IDENTITY, ControlFit.nothing(control.num_points))
+        return Controlled(block, sigmas, IDENTITY, ControlFit.nothing(control.num_points))
     found = intersect(block, control, adjusted.mark_used)
     variance = _pose_variance(adjusted, sigmas, found) + found.variance_m2
     method, affine, left_out = "none", IDENTITY, np.zeros(control.num_points, bool)
@@ -69,6 +76,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
         found = replace(found, point_m=similarity.points(found.point_m))
         if method == "affine":
             affine = fit_affine(*(part[use & ~left_out] for part in (found.point_m, control.xyz_m, std)))
+        sigmas = _without_absolute(sigmas)
     points = apply_affine(affine, found.point_m)
     off = np.where(np.isfinite(control.std_m), points - control.xyz_m, np.nan)
     std = np.sqrt(np.where(np.isfinite(control.std_m), control.std_m, np.nan) ** 2 + variance)
@@ -90,6 +98,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
         offset = np.where(enough, -median_offset(block, reference), np.nan)
     return Controlled(
         block,
+        sigmas,
         affine,
         ControlFit(
             adjusted_m=points,
@@ -104,6 +113,16 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
             check_rms_m=_rms(residual[control.is_check]),
             gnss_minus_control_m=offset,
         ),
+    )
+
+
+def _without_absolute(sigmas: Uncertainty) -> Uncertainty:
+    return replace(
+        sigmas,
+        position_std_m=np.full_like(sigmas.position_std_m, np.nan),
+        point_std_m=np.full_like(sigmas.point_std_m, np.nan),
+        why_not="Sigmas of positions and points are not given after a fit to control: those of the adjustment before "
+        "it do not hold there. control.method=adjust gives them.",
     )
 
 

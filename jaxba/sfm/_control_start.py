@@ -8,7 +8,7 @@ taken to look down on average then, and the points to lie at the height of the f
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -95,8 +95,7 @@ def _level(rotation: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3 3"]) -> 
 
 def determines_tilt(xyz_m: Float[np.ndarray, "n 3"], std_m: Float[np.ndarray, "n 3"]) -> bool:
     """Whether points fix a block's tilt and height: three with heights that lie on no line."""
-    with_height: Bool[np.ndarray, " n"] = np.isfinite(std_m).all(axis=1)
-    return not is_collinear(xyz_m[with_height])
+    return not is_collinear(xyz_m[np.isfinite(std_m).all(axis=1)])
 
 
 def fit_similarity(

@@ -72,9 +72,19 @@ def gnss_fit(block: Block, reference: Reference) -> GnssFit:
 
 
 def findings(
-    adjusted: Adjusted, start: Block, sigmas: Uncertainty, fit: GnssFit, reference: Reference, photos: Sequence[Photo]
+    adjusted: Adjusted,
+    start: Block,
+    sigmas: Uncertainty,
+    fit: GnssFit,
+    reference: Reference,
+    photos: Sequence[Photo],
+    *,
+    is_controlled: bool = False,
 ) -> tuple[str, ...]:
-    """Return the findings on an adjusted block; `start` is the block before the adjustment."""
+    """Return the findings on an adjusted block.
+
+    - `start`: the block before the adjustment. `is_controlled`: control points fix it in all axes.
+    """
     block = adjusted.block
     return tuple(
         [
@@ -85,9 +95,9 @@ def findings(
             *_scatter(adjusted, reference, fit),
             *_height_drift(block, reference),
             *_no_heights(block, reference),
-            *_focal_and_height(block, sigmas, reference),
+            *_focal_and_height(block, sigmas, reference, is_controlled),
             *_intrinsics(block, start, photos),
-            *_positions(block, sigmas, reference, photos),
+            *_positions(block, sigmas, reference, photos, is_controlled),
             *([sigmas.why_not] if sigmas.why_not else []),
         ]
     )
@@ -205,8 +215,11 @@ def _no_heights(block: Block, reference: Reference) -> list[str]:
     ]
 
 
-def _focal_and_height(block: Block, sigmas: Uncertainty, reference: Reference) -> list[str]:
-    """The focal length and the height above ground of a flat nadir block trade off: df / f = dh / h."""
+def _focal_and_height(block: Block, sigmas: Uncertainty, reference: Reference, is_controlled: bool) -> list[str]:
+    """The focal length and the height above ground of a flat nadir block trade off: df / f = dh / h.
+
+    The flight's own record is compared where no control points have fixed heights.
+    """
     if not block.is_georeferenced:
         return []
     names = CAMERAS[block.camera_model].parameter_names()
@@ -224,7 +237,7 @@ def _focal_and_height(block: Block, sigmas: Uncertainty, reference: Reference) -
     if both.any():
         adjusted_median, measured_median = float(np.median(adjusted_m[both])), float(np.median(measured_m[both]))
         ratio = adjusted_median / measured_median
-        contradicts = abs(ratio - 1) > _HEIGHT_OFF
+        contradicts = abs(ratio - 1) > _HEIGHT_OFF and not is_controlled
         tie = (
             f"The cameras are {adjusted_median:.1f} m above the ground points by the adjustment and "
             f"{measured_median:.1f} m above the take-off point by the flight's own record ({ratio - 1:+.0%})"
@@ -292,7 +305,9 @@ def _intrinsics(block: Block, start: Block, photos: Sequence[Photo]) -> list[str
     return found
 
 
-def _positions(block: Block, sigmas: Uncertainty, reference: Reference, photos: Sequence[Photo]) -> list[str]:
+def _positions(
+    block: Block, sigmas: Uncertainty, reference: Reference, photos: Sequence[Photo], is_controlled: bool
+) -> list[str]:
     std = sigmas.position_std_m
     known = np.isfinite(std).all(axis=0)  # not the axes in which no position is measured
     if not known.any():
@@ -307,7 +322,7 @@ def _positions(block: Block, sigmas: Uncertainty, reference: Reference, photos: 
             f"{_names(block, photos, weak, [f'{largest[i]:.2g} m' for i in weak])}."
         )
     used = used_positions(block, reference)
-    if used.any():
+    if used.any() and not is_controlled:
         stated = np.median(reference.std_m[block.image_index[used]], axis=0)
         if np.isfinite(stated[0]) and stated[0] > 1:
             found.append(

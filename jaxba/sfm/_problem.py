@@ -101,8 +101,11 @@ def to_problem(
     )  # fmt: skip
     if control is not None:
         number = block.num_points + np.arange(len(control.rows))
-        prior = ControlPointPrior(number.astype(np.int32), control.xyz_m, control.std_m, CONTROL_LOSS)
-        priors.append(prior)
+        priors.append(
+            ControlPointPrior(
+                point_index=number.astype(np.int32), xyz=control.xyz_m, std_m=control.std_m, loss=CONTROL_LOSS
+            )
+        )
         points = np.concatenate([points, control.start_m])
         xy_px = np.concatenate([xy_px, control.observation_xy_px])
         std = np.concatenate([std, np.full(len(control.observation_image), control.std_px)])

@@ -17,6 +17,7 @@ from jaxba.scene import Left, Photo
 
 _OUTSIDE = 0.1  # of all marks: more of them outside are no single mistakes
 _SAME_FORMAT = 0.02  # the format, width over height, of a photo that was only scaled
+_ONE_PIXEL = 2.0  # px: as near to each other are marks of one target
 _SHOWN = 3
 
 
@@ -85,10 +86,32 @@ def marks_in_photos(
             )
         )
     keep = ~outside
+    notes += _same_pixel(points, photos, np.array(point), np.array(image), xy_px)
     return PhotoMarks(
         point=np.array(point, np.int64)[keep], image=np.array(image, np.int64)[keep], xy_px=xy_px[keep],
         left_out=tuple(left), notes=tuple(notes),
     )  # fmt: skip
+
+
+def _same_pixel(
+    points: Sequence[SurveyedPoint],
+    photos: Sequence[Photo],
+    point: Int[np.ndarray, " marks"],
+    image: Int[np.ndarray, " marks"],
+    xy_px: Float[np.ndarray, "marks 2"],
+) -> list[str]:
+    """Return notes on pairs of points that lie apart and are marked at one pixel of a photo: one has the wrong name."""
+    found = []
+    for k in range(len(point)):
+        near = np.flatnonzero((image == image[k]) & (np.hypot(*(xy_px - xy_px[k]).T) < _ONE_PIXEL))
+        for other in near[near > k]:
+            one, two = points[point[k]], points[point[other]]
+            if (one.x, one.y) != (two.x, two.y):
+                found.append(
+                    f"{one.name} and {two.name} are marked at one pixel of {photos[image[k]].name} and lie apart: one "
+                    "of the marks is wrong."
+                )
+    return found
 
 
 def _outside(xy_px: Float[np.ndarray, "marks 2"], size_px: Float[np.ndarray, "marks 2"]) -> Bool[np.ndarray, " marks"]:

@@ -194,7 +194,7 @@ def _write_tile(inputs: Inputs) -> list[str]:
         inputs.photos,
         std_px=adjusted.std_px,
         position_scale=adjusted.position_scale,
-        control=control_part(block, inputs.control, adjusted.mark_used),
+        control=control_part(block, inputs.control, adjusted.mark_used, adjusted.control.scale),
     )
     known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
     left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]

@@ -70,6 +70,7 @@ class ControlFit:
     - `std_m`: predicted sigma of the adjusted point. `num_marks`: used. `mark_rms_px`: of their errors.
     - `over_sigma`: the largest of the three differences between point and survey over its predicted sigma.
     - `is_suspect`: over the limit of the blunder test.
+    - `scale`: that sigmas of control were multiplied by, horizontal and vertical, since the points scatter by that.
     - `method`: by which control was used; `none` where it could not be.
     - `control_rms_m`, `check_rms_m`: an axis, over all points that have a residual in it.
     - `gnss_minus_control_m`: what all GNSS positions are off in common, where control fixes the block.
@@ -86,6 +87,7 @@ class ControlFit:
     control_rms_m: Float[np.ndarray, "3"]
     check_rms_m: Float[np.ndarray, "3"]
     gnss_minus_control_m: Float[np.ndarray, "3"]
+    scale: Float[np.ndarray, "2"]
 
     @staticmethod
     def nothing(num_points: int = 0) -> "ControlFit":
@@ -103,4 +105,5 @@ class ControlFit:
             control_rms_m=np.full(3, np.nan),
             check_rms_m=np.full(3, np.nan),
             gnss_minus_control_m=np.full(3, np.nan),
+            scale=np.ones(2),
         )

@@ -24,7 +24,15 @@ from jaxba.ba._plan import Shape
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
 from jaxba.scene import Block, Control, Features, Left, Photo, Reference, Tracks, ViewGraph
 from jaxba.sfm._complete import complete_tracks
-from jaxba.sfm._control import ControlPart, agreeing_marks, control_part, gnss_offset, with_offset
+from jaxba.sfm._control import (
+    LEAST_TO_PLACE,
+    ControlPart,
+    agreeing_marks,
+    control_part,
+    control_scale,
+    gnss_offset,
+    with_offset,
+)
 from jaxba.sfm._edges import edge_medians_px, match_rows, without_edges
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
 from jaxba.sfm._points import apply_points, track_rows, triangulate_tracks
@@ -120,7 +128,9 @@ def adjust(
         last = len(medians) + 1 >= settings.max_rounds
         free = every if medians or last else small
         steps = settings.max_nfev if last or settled else _ROUND_STEPS if medians else _FIRST_STEPS
-        solved = rounds.solve(block, std_px, free, mark_used, shape, max_nfev=min(steps, settings.max_nfev))
+        solved = rounds.solve(
+            block, std_px, free, mark_used, shape, max_nfev=min(steps, settings.max_nfev), is_later=bool(medians)
+        )
         block = solved.block
         medians.append(float(np.median(solved.error_px)))
         _log.info("round %d, median %.2f px", len(medians), medians[-1])
@@ -219,13 +229,21 @@ class _Rounds:
         shape: Shape | None,
         *,
         max_nfev: int,
+        is_later: bool,
     ) -> _Solved:
-        """Solve a block; `free` are the camera's parameters that may change, `shape` has the least sizes."""
+        """Solve a block; `free` are the camera's parameters that may change, `shape` has the least sizes.
+
+        - `mark_used`: of all marks of control. `is_later`: than the first round.
+        """
         settings = self.settings
         model = LOSSES[settings.loss]
         loss = Linear() if model is Linear else model(f_scale=settings.f_scale / std_px)  # type: ignore[call-arg]
         scale = position_scale(block, self.reference)
-        control = control_part(block, self.control, mark_used)
+        scale_of_control = None
+        if is_later and self.control.num_points:
+            is_free = used_positions(block, self.reference).sum() < LEAST_TO_PLACE
+            scale_of_control = control_scale(block, self.control, mark_used, is_free=is_free)
+        control = control_part(block, self.control, mark_used, scale_of_control)
         offset_m = gnss_offset(block, self.reference, control)
         reference = with_offset(self.reference, offset_m)
         held = [name for name in CAMERAS[block.camera_model].parameter_names() if name not in free]

@@ -4,6 +4,10 @@ A control point's marks are observations with a sigma of their own, whatever tha
 and MAD of the tie points' errors reject none of them. Its surveyed coordinates are a prior with Huber's loss: a wrong
 point pulls no harder than one that is off by `CONTROL_LOSS` sigmas. Check points are intersected from their marks only.
 
+Where most points contradict the block by far more than their sigmas, the survey is worse than it claims: their sigmas
+are multiplied by `control_scale`, as those of GNSS positions are. It is asked after a solve with the sigmas as stated,
+so that a block that is merely bent has been bent right before.
+
 A mark is wrong where the others of its point agree without it and miss it by more than `_WRONG` sigmas, and where no
 other mark can be blamed; two rays cannot tell which of them is wrong.
 """
@@ -21,6 +25,7 @@ CONTROL_LOSS = Huber(3.0)
 LEAST_TO_PLACE = 3
 """Control points that place a block, and that tell an offset of GNSS positions from it."""
 _WRONG = 5.0  # sigmas of a mark
+_CONTRADICTS = 3.0  # sigmas, robust, of all control points
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,6 +33,7 @@ class ControlPart:
     """Control points that a block's images show twice or more, ready to stand behind its own points in a problem.
 
     - `rows`: of the points in `Control`. `start_m`: start values. `xyz_m`, `std_m`: as surveyed.
+    - `scale`: that `std_m` were multiplied by, horizontal and vertical.
     - `observation_image`: row in the block's `image_index`. `observation_point`: row here.
     """
 
@@ -39,6 +45,7 @@ class ControlPart:
     observation_point: Int[np.ndarray, " observations"]
     observation_xy_px: Float[np.ndarray, "observations 2"]
     std_px: float
+    scale: Float[np.ndarray, "2"]
 
     @property
     def determined(self) -> Bool[np.ndarray, "3"]:
@@ -115,7 +122,7 @@ def agreeing_marks(block: Block, control: Control) -> Bool[np.ndarray, " marks"]
     limit = _WRONG * control.mark_std_px
     for _ in range(2):  # wrong ones of a point
         error = intersect(block, control, use).error_px
-        doubtful = np.unique(control.mark_point[use & (error > limit)])
+        doubtful = np.unique(control.mark_point[use & ~(error <= limit)])
         for k in doubtful:
             mine = np.flatnonzero(use & (control.mark_point == k))
             if len(mine) < 3:
@@ -125,35 +132,63 @@ def agreeing_marks(block: Block, control: Control) -> Bool[np.ndarray, " marks"]
                 rest = use.copy()
                 rest[mark] = False
                 without = intersect(block, control, rest).error_px
-                if np.nanmax(without[mine[mine != mark]]) <= limit and without[mark] > limit:
+                if (without[mine[mine != mark]] <= limit).all() and without[mark] > limit:
                     blamed.append(mark)
             if len(blamed) == 1:
                 use[blamed[0]] = False
     return use
 
 
-def control_part(block: Block, control: Control, use: Bool[np.ndarray, " marks"]) -> ControlPart | None:
-    """Return the control points that stand in an adjustment; None where there are none, or the block has no place."""
+def control_part(
+    block: Block, control: Control, use: Bool[np.ndarray, " marks"], scale: Float[np.ndarray, "2"] | None = None
+) -> ControlPart | None:
+    """Return the control points that stand in an adjustment; None where there are none, or the block has no place.
+
+    `scale`: on their sigmas, horizontal and vertical.
+    """
+    scale = np.ones(2) if scale is None else scale
     if not block.is_georeferenced or control.method != "adjust":
         return None
     row = image_rows(block, control)
     use = use & (row >= 0) & ~control.is_check[control.mark_point]
-    count = np.bincount(control.mark_point[use], minlength=control.num_points)
-    rows = np.flatnonzero(count >= 2)
+    found = intersect(block, control, use).point_m
+    rows = np.flatnonzero(np.isfinite(found).all(axis=1) & ~control.is_check)
     if not len(rows):
         return None
     number = np.full(control.num_points, -1)
     number[rows] = np.arange(len(rows))
     keep = use & (number[control.mark_point] >= 0)
-    found = intersect(block, control, use).point_m[rows]
-    xyz, std = control.xyz_m[rows], control.std_m[rows]
-    middle = np.median(block.points_m, axis=0) if block.num_points else np.zeros(3)
-    start = np.where(np.isfinite(found), found, np.where(np.isfinite(std), xyz, middle))
     return ControlPart(
-        rows=rows, start_m=start, xyz_m=xyz, std_m=std, observation_image=row[keep],
+        rows=rows, start_m=found[rows], xyz_m=control.xyz_m[rows], std_m=control.std_m[rows] * scale[[0, 0, 1]],
+        scale=scale, observation_image=row[keep],
         observation_point=number[control.mark_point[keep]], observation_xy_px=control.mark_xy_px[keep],
         std_px=control.mark_std_px,
     )  # fmt: skip
+
+
+def control_scale(
+    block: Block, control: Control, use: Bool[np.ndarray, " marks"], *, is_free: bool
+) -> Float[np.ndarray, "2"]:
+    """Return what the sigmas of control points are multiplied by, horizontal and vertical, 1 but for contradictions.
+
+    The median of the differences between points intersected from their marks and surveyed ones, over 0.6745 of their
+    sigmas, where it is over `_CONTRADICTS`. `is_free`: nothing but control places the block, which takes up seven of
+    the differences.
+    """
+    found = intersect(block, control, use)
+    mine = ~control.is_check & np.isfinite(found.point_m).all(axis=1)
+    known = mine[:, None] & np.isfinite(control.std_m)
+    with np.errstate(invalid="ignore"):
+        over = np.abs(found.point_m - control.xyz_m) / np.sqrt(control.std_m**2 + found.variance_m2)
+    scale = np.ones(2)
+    for k, (axes, taken) in enumerate(((slice(0, 2), 4), (slice(2, 3), 3))):
+        values = over[:, axes][known[:, axes]]
+        left = len(values) - (taken if is_free else 0)
+        if left < 2:
+            continue
+        ratio = float(np.median(values)) / 0.6745 * np.sqrt(len(values) / left)
+        scale[k] = ratio if ratio > _CONTRADICTS else 1.0
+    return scale
 
 
 def gnss_offset(block: Block, reference: Reference, control: ControlPart | None) -> Float[np.ndarray, "3"]:

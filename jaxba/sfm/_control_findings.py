@@ -25,6 +25,7 @@ def control_findings(
             *_unused(block, control, fit),
             *_too_few(block, control, fit, reference),
             *_wrong_marks(block, adjusted, control, fit, photos),
+            *_scatter(control, fit),
             *_suspects(control, fit),
             *_offset(block, fit, reference),
         ]
@@ -102,6 +103,22 @@ def _wrong_marks(
                 "photos."
             )
     return found
+
+
+def _scatter(control: Control, fit: ControlFit) -> list[str]:
+    known = ~control.is_check & np.isfinite(fit.adjusted_m).all(axis=1)
+    parts = []
+    for word, axis, scale in (("horizontally", 0, fit.scale[0]), ("in height", 2, fit.scale[1])):
+        if scale > 1:
+            stated = float(np.median(control.std_m[known, axis]))
+            parts.append(f"{scale * stated:.2g} m {word} where their sigma is {stated:.2g} m")
+    if not parts:
+        return []
+    return [
+        f"The {known.sum()} control points contradict the block, most of them and not one: they scatter by "
+        f"{', '.join(parts)}. Their sigmas were enlarged to that. Compare how they were surveyed with control.std_h "
+        "and control.std_v, and check their CRS, names and marks."
+    ]
 
 
 def _suspects(control: Control, fit: ControlFit) -> list[str]:

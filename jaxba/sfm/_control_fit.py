@@ -60,6 +60,8 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
     block = adjusted.block
     if not control.num_points or not block.is_georeferenced:
         return Controlled(block, sigmas, IDENTITY, ControlFit.nothing(control.num_points))
+    scale = np.ones(2) if adjusted.control is None else adjusted.control.scale
+    control = replace(control, std_m=control.std_m * scale[[0, 0, 1]])
     found = intersect(block, control, adjusted.mark_used)
     variance = _pose_variance(adjusted, sigmas, found) + found.variance_m2
     method, affine, left_out = "none", IDENTITY, np.zeros(control.num_points, bool)
@@ -112,6 +114,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
             control_rms_m=_rms(residual[~control.is_check]),
             check_rms_m=_rms(residual[control.is_check]),
             gnss_minus_control_m=offset,
+            scale=scale,
         ),
     )
 

@@ -1,0 +1,95 @@
+"""gcp_list.txt and CSV lists of control points."""
+
+from pathlib import Path
+
+import pytest
+from pyproj import CRS
+
+from jaxba._errors import JaxbaError
+from jaxba.io import parse_control
+
+LIST = """EPSG:32615
+# a comment
+576308.60 5183424.70 198.25 1200.5 900 a.jpg gcp01 surveyed on Monday
+
+576308.60 5183424.70 198.25 310 905 b.jpg gcp01
+576320.00\t5183430.00\t197.5\t20\t30\tflight 2/b.jpg\tgcp 02
+"""
+
+
+def test_documented_form_is_read():
+    first, second = parse_control(LIST).points
+    assert (first.name, first.crs, first.x, first.y, first.z_m) == ("gcp01", "EPSG:32615", 576308.6, 5183424.7, 198.25)
+    assert [(m.image, m.x_px, m.y_px) for m in first.marks] == [("a.jpg", 1200.5, 900.0), ("b.jpg", 310.0, 905.0)]
+    assert first.marks[1].source == "gcp_list.txt line 5"
+    assert (second.name, second.marks[0].image) == ("gcp 02", "flight 2/b.jpg")  # tabs leave blanks in names
+    assert not first.is_check and first.std_h_m is None
+
+
+def test_points_without_names_are_told_apart_by_their_coordinates():
+    text = "EPSG:32615\n1 2 3 10 20 a.jpg\n4 5 6 11 21 a.jpg point2\n7 8 9 12 22 a.jpg\n1 2 3 13 23 b.jpg\n"
+    found = {point.name: [m.image for m in point.marks] for point in parse_control(text).points}
+    assert found == {"point1": ["a.jpg", "b.jpg"], "point2": ["a.jpg"], "point3": ["a.jpg"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "epsg", "points", "marks", "first"),
+    [
+        ("gcp/bellus_gcp_list.txt", 32617, 4, 4, (441024.15704911412, 4564001.8747091573, 345.1689312)),
+        ("gcp/sheffield_cross_gcp_list.txt", 32617, 5, 25, (333158.20, 3102916.18, 3.0)),
+        ("images/copr/gcp_list.txt", 32611, 10, 27, (235269.88, 3811198.11, 0.0)),
+    ],
+)
+def test_real_lists_are_read_with_their_headers(data_dir: Path, name: str, epsg: int, points: int, marks: int, first):
+    found = parse_control((data_dir / name).read_text()).points
+    assert len(found) == points and sum(len(point.marks) for point in found) == marks
+    assert (found[0].x, found[0].y, found[0].z_m) == first
+    assert {CRS(point.crs).to_epsg(min_confidence=20) for point in found} == {epsg}
+    assert len({point.name for point in found}) == points
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_csv_has_columns_by_name_in_any_order(separator: str):
+    header = ["image", "px", "py", "Name", "Easting (m)", "northing", "height", "std_h", "std_v", "role"]
+    rows = [
+        ["a.jpg", "10", "20", "p1", "576308.6", "5183424.7", "198.2", "0.01", "0", "Check point"],
+        ["b.jpg", "11", "21", "p1", "576308.6", "5183424.7", "198.2", "0.01", "0", "check"],
+        ["a.jpg", "12", "22", "p2", "576300", "5183420", "", "", "", "control"],
+    ]
+    text = "\n".join(["# EPSG:32615", separator.join(header), *(separator.join(row) for row in rows)])
+    one, two = parse_control(text, "points.csv").points
+    assert (one.name, one.is_check, one.std_h_m, one.std_v_m, len(one.marks)) == ("p1", True, 0.01, None, 2)
+    assert (two.name, two.is_check, two.z_m, two.crs) == ("p2", False, None, "EPSG:32615")
+
+
+def test_csv_of_longitude_and_latitude_is_wgs_84():
+    point = parse_control("name,lat,lon,alt,px,py,filename,colour\np,46.8,-92,198,1,2,a.jpg,red").points[0]
+    assert (point.crs, point.x, point.y, point.z_m) == ("EPSG:4326", -92.0, 46.8, 198.0)
+    assert "colour" in parse_control("name,lat,lon,alt,px,py,filename,colour\np,46.8,-92,198,1,2,a.jpg,red").notes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty; give a CRS line"),
+        ("EPSG:32615\n", "lists no mark"),
+        ("EPSG:99999\n1 2 3 4 5 a.jpg", "line 1: 'EPSG:99999' is no CRS; give EPSG:4326"),
+        ("WGS84 UTM 61N\n1 2 3 4 5 a.jpg", "line 1: UTM zone 61 does not exist"),
+        ("1 2 3 4 5 a.jpg", "line 1: '1 2 3 4 5 a.jpg' is no CRS"),
+        ("EPSG:32615\n1 2 3 4 a.jpg", r"line 2: '1 2 3 4 a.jpg' has 5 columns; give x y z px py image"),
+        ("EPSG:32615\n1 2 3,5 4 5 a.jpg", "line 2: z '3,5' is no number; write it with a point"),
+        ("EPSG:32615\n1 2 nan 4 5 a.jpg", "line 2: z 'nan' is no number"),
+        ("EPSG:4326\n44.9 -93.2 1 4 5 a.jpg", "line 2: latitude -93.2 is out of range; x is the longitude"),
+        ("EPSG:32615\n1 2 3 4 5 a.jpg p\n1 2.5 3 4 5 b.jpg p", "line 3: p has y 2.5, and 2.0 in gcp_list.txt line 2"),
+        ("EPSG:32615\n1 2 3 4 5 a.jpg p\n1 2 3 6 7 a.jpg p", "line 3: p is marked in a.jpg twice, at 6 7 here and 4 5"),
+        ("name,x,y,px,image\np,1,2,3,a.jpg", "lack py; name them x, y"),
+        ("name,x,y,z,px,py,image\np,1,2,3,4,5,a.jpg", "x and y need a CRS; add a crs column"),
+        ("# EPSG:32615\nname,x,y,px,py,image,role\np,1,2,4,5,a.jpg,maybe", "line 3: role 'maybe' is not known"),
+        ("# EPSG:32615\nname,x,y,px,py,image,std_h\np,1,2,4,5,a.jpg,-1", "line 3: std_h -1 is negative"),
+        ("# EPSG:32615\nname,x,y,px,py,image\np,1,2,4,5,", "line 3: image '' is empty"),
+        ("# EPSG:32615\nname,x,y,px,py,image\np,1,,4,5,a.jpg", "line 3: y '' is no number"),
+    ],
+)
+def test_bad_lists_are_refused_with_line_field_and_cure(text: str, message: str):
+    with pytest.raises(JaxbaError, match=message):
+        parse_control(text)

@@ -1,0 +1,212 @@
+"""The control stage: roles, scale of marks, heights, places; what cannot be used is named, what is wrong is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxba._errors import JaxbaError
+from jaxba.geo import projected_from_local
+from jaxba.pipeline import control, crs, metadata
+from jaxba.pipeline.control import Inputs, Outputs, Params
+from jaxba.scene import Photo, PhotoFile, Position, Reference
+
+LON, LAT = -92.0, 46.8
+X, Y = 576308.6, 5183424.7
+
+
+def photos(*, with_positions: bool = True, **changes: Any) -> tuple[Photo, ...]:
+    return tuple(
+        Photo(
+            name=f"{name}.jpg", path=Path(), sha256="0", width_px=1600, height_px=1200, camera="c",
+            position=Position(x=LON + 1e-4 * k, y=LAT, z_m=260.0) if with_positions else None, **changes,
+        )
+        for k, name in enumerate("abcd")
+    )  # fmt: skip
+
+
+def reference(of: tuple[Photo, ...], **params: Any) -> Reference:
+    return crs.run(crs.Inputs(photos=of), crs.Params(**params)).reference
+
+
+def gcp_list(
+    *, scale: float = 1.0, z: float | None = None, header: str = "EPSG:32615", dx: float = 0.0, swap: bool = False
+) -> str:
+    """Four points in all four photos."""
+    lines = [header]
+    for k in range(4):
+        x, y = X + 20 * k + dx, Y + 15 * (k % 2)
+        x, y = (y, x) if swap else (x, y)
+        height = 198.0 + k if z is None else z
+        lines += [f"{x} {y} {height} {scale * (300 + 350 * k)} {scale * 700} {photo}.jpg gcp{k}" for photo in "abcd"]
+    return "\n".join(lines)
+
+
+def run(text: str | None = None, *, check: str | None = None, of: tuple[Photo, ...] | None = None, **params) -> Outputs:
+    of = photos() if of is None else of
+    inputs = Inputs(
+        photos=of,
+        reference=reference(of),
+        gcp=("gcp_list.txt", gcp_list() if text is None else text),
+        check=None if check is None else ("check_list.txt", check),
+    )
+    return control.run(inputs, Params(**params))
+
+
+def test_without_a_list_the_reference_passes_through():
+    given = reference(photos())
+    made = control.run(Inputs(photos=photos(), reference=given), Params())
+    assert made.reference is given and made.control.num_points == 0 and made.notes == ()
+
+
+def test_points_lie_where_they_were_surveyed():
+    made = run(std_h=0.05)
+    frame = made.reference.frame
+    assert frame is not None
+    back = projected_from_local(frame, made.control.xyz_m)
+    np.testing.assert_allclose(back[:, :2], [[X + 20 * k, Y + 15 * (k % 2)] for k in range(4)], atol=1e-4)
+    np.testing.assert_allclose(back[:, 2], [198, 199, 200, 201], atol=1e-4)
+    np.testing.assert_allclose(made.control.std_m, [[0.05, 0.05, 0.03]] * 4)
+    assert made.control.mark_point.tolist() == [0] * 4 + [1] * 4 + [2] * 4 + [3] * 4
+    assert made.control.mark_image.tolist() == [0, 1, 2, 3] * 4
+
+
+def test_check_points_come_from_a_list_a_role_or_a_parameter():
+    names = lambda made: [name for name, is_check in zip(made.control.names, made.control.is_check) if is_check]  # noqa: E731, B905
+    assert names(run(check="gcp1; gcp3".replace(";", ",") and gcp_list())) == ["gcp0", "gcp1", "gcp2", "gcp3"]
+    lines = gcp_list().splitlines()
+    only_first = "\n".join(lines[:5])
+    both = run(check=only_first)  # the name stands in both lists, with the same marks
+    assert names(both) == ["gcp0"] and len(both.control.mark_point) == 16
+    of = photos()
+    made = control.run(Inputs(photos=of, reference=reference(of), gcp=("g", gcp_list())), Params(check="gcp1, gcp3"))
+    assert names(made) == ["gcp1", "gcp3"]
+    csv = "# EPSG:32615\nname,x,y,z,px,py,image,role\n" + "\n".join(
+        f"{row[6]},{row[0]},{row[1]},{row[2]},{row[3]},{row[4]},{row[5]},{'check' if row[6] == 'gcp2' else ''}"
+        for row in (line.split() for line in lines[1:])
+    )
+    assert names(run(csv)) == ["gcp2"]
+    with pytest.raises(JaxbaError, match=r"no point is called gcp9; the points are gcp0, gcp1"):
+        control.run(Inputs(photos=of, reference=reference(of), gcp=("g", gcp_list())), Params(check="gcp9"))
+    with pytest.raises(JaxbaError, match=r"gcp0 has z_m 199.0, and 198.0 in gcp_list.txt line 2"):
+        run(check=only_first.replace(" 198.0 ", " 199.0 "))
+
+
+def test_marks_of_the_original_photos_are_scaled_by_what_exif_says():
+    made = run(gcp_list(scale=2.5), of=photos(original_size_px=(4000, 3000)))
+    np.testing.assert_allclose(made.control.mark_xy_px, run().control.mark_xy_px)
+    assert any(
+        "16 of 16 marks lie outside" in note and "0.40000" in note and "4000 x 3000" in note for note in made.notes
+    )
+
+
+def test_marks_whose_scale_nothing_tells_are_refused_with_the_cure():
+    for of in (photos(), photos(original_size_px=(4000, 2250)), photos(original_size_px=(1700, 1275))):
+        with pytest.raises(JaxbaError, match=r"16 of 16 marks lie outside.*control.mark_width_px"):
+            run(gcp_list(scale=2.5), of=of)
+    made = run(gcp_list(scale=2.5), mark_width_px=4000)
+    np.testing.assert_allclose(made.control.mark_xy_px, run().control.mark_xy_px)
+
+
+def test_marks_inside_the_files_are_taken_as_they_are():
+    made = run(of=photos(original_size_px=(4000, 3000)))
+    assert np.array_equal(made.control.mark_xy_px, run().control.mark_xy_px)
+    assert any("on the pixel grid of the files" in note for note in made.notes)
+
+
+def test_a_single_mark_outside_and_photos_that_are_not_there_are_named():
+    text = gcp_list().replace("300.0 700.0 a.jpg", "3000 700.0 a.jpg").replace("d.jpg gcp3", "x.jpg gcp3")
+    made = run(text)
+    left = {entry.name: entry.reason for entry in made.left_out}
+    assert "3000 700 (gcp_list.txt line 2) lies outside the photo of 1600 x 1200" in left["gcp0 in a.jpg"]
+    assert "is marked (gcp3), but is none of the photos" in left["x.jpg"]
+    assert len(made.control.mark_point) == 14
+    with pytest.raises(JaxbaError, match=r"marks none of the photos: it names q.jpg"):
+        run(f"EPSG:32615\n{X} {Y} 1 2 3 q.jpg")
+    with pytest.raises(JaxbaError, match=r"gcp0 is marked in a.jpg twice"):
+        run(gcp_list() + f"\n{X} {Y} 198.0 5 6 A.JPG gcp0")
+    once = run(gcp_list() + f"\n{X + 5} {Y} 198.0 5 6 a.jpg lone")
+    assert [entry.name for entry in once.left_out] == ["lone"] and "in 1 of the photos" in once.left_out[0].reason
+
+
+def test_heights_that_are_all_zero_were_not_measured():
+    made = run(gcp_list(z=0.0))
+    assert np.isinf(made.control.std_m[:, 2]).all() and np.isfinite(made.control.xyz_m).all()
+    assert any("all heights are 0" in note and "control.heights=use" in note for note in made.notes)
+    assert np.isfinite(run(gcp_list(z=0.0), heights="use").control.std_m).all()
+    assert np.isinf(run(heights="ignore").control.std_m[:, 2]).all()
+    assert any("all 4 heights are 3" in note for note in run(gcp_list(z=3.0)).notes)
+
+
+def test_control_far_from_the_photos_is_refused_with_what_would_bring_it_there():
+    with pytest.raises(JaxbaError, match=r"control lies 457.5 km from the photos.*With UTM zone 15N \(EPSG:32615\)"):
+        run(gcp_list(header="WGS84 UTM 14N"), max_distance_km=5.0)
+    with pytest.raises(JaxbaError, match=r"does not contain the survey.*Swap x and y"):
+        run(gcp_list(swap=True))
+    with pytest.raises(JaxbaError, match=r"lies 7\.\d km from the photos' positions, over 5 km"):
+        run(gcp_list(dx=7000.0))
+
+
+def test_photos_without_positions_are_placed_by_control_in_its_crs():
+    of = photos(with_positions=False)
+    made = run(of=of)
+    frame = made.reference.frame
+    assert frame is not None and frame.crs == "EPSG:32615" and not made.reference.is_used.any()
+    np.testing.assert_allclose(projected_from_local(frame, made.control.xyz_m)[0], [X, Y, 198], atol=1e-4)
+    other = control.run(
+        Inputs(photos=of, reference=reference(of), target_crs="EPSG:26915", gcp=("g", gcp_list())), Params()
+    ).reference.frame
+    assert other is not None and other.crs == "EPSG:26915"
+    with pytest.raises(JaxbaError, match=r"does not contain the survey"):
+        control.run(
+            Inputs(photos=of, reference=reference(of), target_crs="EPSG:32633", gcp=("g", gcp_list())), Params()
+        )
+    all_check = run("EPSG:32615\n" + f"{X} {Y} 1 2 3 a.jpg p", of=of, check="EPSG:32615\n" + f"{X} {Y} 1 2 3 a.jpg p")
+    assert all_check.reference.frame is None and any("nothing places the block" in note for note in all_check.notes)
+
+
+def test_a_fit_with_too_few_points_is_refused_before_anything_is_matched():
+    two = "\n".join(gcp_list().splitlines()[:9])
+    with pytest.raises(JaxbaError, match=r"control.method=helmert needs 3 control points.*has 2"):
+        run(two, method="helmert")
+    assert run(two).control.num_points == 2
+
+
+def test_drifting_gnss_altitudes_cast_no_doubt_on_heights_that_control_holds():
+    from jaxba.geo import UNTRUSTED
+
+    of = photos()
+    given = reference(of)
+    assert given.frame is not None
+    doubted = replace(given, frame=replace(given.frame, height_note=f"Heights are metres. {UNTRUSTED}"))
+    made = control.run(Inputs(photos=of, reference=doubted, gcp=("g", gcp_list())), Params()).reference.frame
+    assert made is not None and UNTRUSTED not in made.height_note and "Control points hold them" in made.height_note
+
+
+def test_real_marks_in_original_pixels_are_noticed(data_dir: Path):
+    """41 photos scaled from 4272 to 1600 px, 27 marks in the original's pixels, no GNSS, all heights 0."""
+    folder = data_dir / "images" / "copr"
+    files = tuple(PhotoFile(name=p.name, path=p, sha256=p.name) for p in sorted(folder.glob("*.jpg")))
+    of = metadata.run(metadata.Inputs(files=files), metadata.Params()).photos
+    text = (folder / "gcp_list.txt").read_text()
+    made = control.run(
+        Inputs(photos=of, reference=reference(of), gcp=("gcp_list.txt", text)), Params(check="gcp03, gcp05, gcp08")
+    )
+    assert len(of) == 41 and made.control.num_points == 10 and made.control.is_check.sum() == 3
+    assert any("22 of 27 marks lie outside" in n and "0.37453" in n and "4272 x 2848" in n for n in made.notes)
+    np.testing.assert_allclose(made.control.mark_xy_px[0], [3609.3727839973 * 1600 / 4272, 2293.7951481 * 1067 / 2848])
+    frame = made.reference.frame
+    assert frame is not None and frame.crs == "EPSG:32611" and np.isinf(made.control.std_m[:, 2]).all()
+    assert [entry.name for entry in made.left_out] == ["gcp00"]
+    assert (
+        "gcp04 and gcp00 are marked at one pixel of IMG_0031.jpg and lie apart: one of the marks is wrong."
+        in made.notes
+    )
+    with pytest.raises(JaxbaError, match=r"EXIF does not tell an original size"):
+        control.run(
+            Inputs(photos=tuple(replace(p, original_size_px=None) for p in of), reference=reference(of),
+                   gcp=("gcp_list.txt", text)),
+            Params(),
+        )  # fmt: skip

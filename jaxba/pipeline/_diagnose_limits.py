@@ -1,10 +1,9 @@
 """Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
 
-from dataclasses import replace
-
 from jaxba.pipeline._diagnosis import Diagnosis, some
 from jaxba.pipeline._limits import store_bytes
 from jaxba.pipeline._recorded import Recorded
+from jaxba.pipeline._tuning import tune
 from jaxba.pipeline._workers import Resources, bytes_of, machine_memory, memory_for
 
 _BY_PHOTOS = ("features", "match")
@@ -67,8 +66,9 @@ def over_store(case: Recorded) -> Diagnosis | None:
     if case.stopped is None or case.stopped.name != "features" or case.done.pairs is None:
         return None
     resources: Resources = case.done.settings["workers"]
-    params = replace(case.done.settings["features"], detector=case.done.routing.detector)
-    need, allowed = store_bytes(len(case.done.photos), params), bytes_of(resources.max_store, float("nan"))
+    nfeatures = tune(case.done.routing.detector, (), None, nfeatures=case.done.settings["features"].nfeatures).nfeatures
+    need = store_bytes(len(case.done.photos), case.done.routing.detector, nfeatures)
+    allowed = bytes_of(resources.max_store, float("nan"))
     if not need > allowed:
         return None
     return Diagnosis(

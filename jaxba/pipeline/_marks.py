@@ -104,7 +104,7 @@ def _same_pixel(
     found = []
     for k in range(len(point)):
         near = np.flatnonzero((image == image[k]) & (np.hypot(*(xy_px - xy_px[k]).T) < _ONE_PIXEL))
-        for other in near[near > k]:
+        for other in near[near > k].tolist():
             one, two = points[point[k]], points[point[other]]
             if (one.x, one.y) != (two.x, two.y):
                 found.append(

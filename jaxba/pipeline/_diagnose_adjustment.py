@@ -1,5 +1,7 @@
 """Rules on the adjustment: a large median error, parameters at their bounds, a solver that runs out of steps."""
 
+from typing import Any
+
 import numpy as np
 
 from jaxba._errors import JaxbaError
@@ -7,24 +9,22 @@ from jaxba.pipeline._diagnosis import Diagnosis, some
 from jaxba.pipeline._recorded import Recorded
 from jaxba.scene import Photo, PhotoFile
 
-_LARGE_PX = 3.0
 _HIGH_COST_PX = 1.5
-_OFF = 0.05  # of the focal length
 
 
 def large_median(case: Recorded) -> Diagnosis | None:
-    """Errors over 3 px, or start values that nothing fits: wrong focal length, mixed cameras, corrupt edges."""
+    """Large errors, few that fit, or start values that nothing fits: wrong focal length, mixed cameras, corrupt edges."""
     done = case.done
     failed = case.stopped is not None and case.stopped.name in ("start", "adjust") and done.tracks is not None
     median_px = None if done.adjust is None else done.adjust.median_px
-    if not failed and (median_px is None or median_px <= _LARGE_PX):
+    if not failed and not has_large_errors(case):
         return None
     if failed and _mean_angle_deg(case) < 1.0:
         return None  # photos from one place: another rule's
     graph = done.match.view_graph
     edges = graph.is_edge
     begin = (
-        f"The median reprojection error is {median_px:.1f} px"
+        f"The median reprojection error is {median_px:.2f} px and {done.adjust.inlier_rate:.0%} of the observations fit"
         if median_px is not None
         else f"No block fits the matches (stage {case.stopped.name}: {case.stopped.reason.rstrip('.')})"
         if case.stopped
@@ -37,13 +37,21 @@ def large_median(case: Recorded) -> Diagnosis | None:
     text += f"{cameras} "
     text += f"Edges left out: {some([left.name for left in pruned], 3)}." if pruned else "No edge was left out."
     return Diagnosis(
-        name="large median error",
+        name="large errors",
         cause=text,
         cure="Compare the focal length with the sensor's specification and set metadata.focal, or leave it to the "
         "tags; keep photos of one camera, zoom and size in one folder; look at the photos of the edges named.",
         figures={"median_px": median_px, "edge_median_px": edge_px, "focal_px": focals,
                  "pruned": [left.name for left in pruned]},
     )  # fmt: skip
+
+
+def has_large_errors(case: Recorded) -> bool:
+    """Whether the adjusted block fails what verification asks of its errors."""
+    adjusted, limits = case.done.adjust, case.done.settings["verify"]
+    if adjusted is None:
+        return False
+    return adjusted.median_px > limits.max_median_px or adjusted.inlier_rate < limits.min_inlier_rate
 
 
 def _mean_angle_deg(case: Recorded) -> float:
@@ -84,14 +92,19 @@ def _tagged_focal(photo: Photo) -> float | None:
         return None
 
 
+def bounds_reached(case: Recorded) -> tuple[Any, ...]:
+    """Return the intrinsics of the adjusted block that lie at a bound."""
+    from jaxba.sfm import intrinsics_at_bounds  # loads jax
+
+    return intrinsics_at_bounds(case.done.adjust.block, case.done.start.block, case.done.photos)
+
+
 def at_bound(case: Recorded) -> Diagnosis | None:
     """Distortion or focal length at its bound: self-calibration absorbs model error."""
     done = case.done
     if done.adjust is None:
         return None
-    from jaxba.sfm import intrinsics_at_bounds  # loads jax
-
-    found = intrinsics_at_bounds(done.adjust.block, done.start.block, done.photos)
+    found = bounds_reached(case)
     if not found:
         return None
     texts = [f"{b.parameter} of {b.camera} is {b.value:.4g}, allowed {b.low:.4g} to {b.high:.4g}" for b in found]

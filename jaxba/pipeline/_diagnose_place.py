@@ -9,6 +9,7 @@ from pyproj import CRS, Geod, Transformer
 from pyproj.exceptions import ProjError
 
 from jaxba._errors import JaxbaError
+from jaxba.pipeline._diagnose_adjustment import bounds_reached, has_large_errors
 from jaxba.pipeline._diagnosis import Diagnosis, some
 from jaxba.pipeline._recorded import Recorded
 from jaxba.scene import Photo, PhotoFile, Position
@@ -202,7 +203,8 @@ def contradicting_gnss(case: Recorded) -> Diagnosis | None:
             f"{len(reference.review)} of {len(used)} positions are not used ({reference.review[0].name} "
             f"{reference.review[0].reason.rstrip('.')})"
         )
-    if done.adjust is not None and done.adjust.block.is_georeferenced:
+    is_sound = done.adjust is not None and not has_large_errors(case) and not bounds_reached(case)
+    if is_sound and done.adjust.block.is_georeferenced:  # else the block itself may be what is bent
         texts += _against_photos(case, figures)
     if not texts:
         return None
@@ -223,9 +225,9 @@ def _against_photos(case: Recorded, figures: dict[str, object]) -> list[str]:
     block, reference = done.adjust.block, done.crs.reference
     fit = gnss_fit(block, reference)
     bad: Bool[np.ndarray, " images"] = fit.is_outlier
-    if bad.sum() > _OUTLIERS * max(fit.num + bad.sum(), 1):
+    most = float(np.nanmax(np.abs(fit.residual_m[bad]))) if bad.any() else 0.0
+    if bad.sum() > _OUTLIERS * (fit.num + bad.sum()) and most > _METRE:
         names = [done.photos[i].name for i in block.image_index[bad]]
-        most = float(np.nanmax(np.abs(fit.residual_m[bad])))
         figures |= {"outliers": names, "largest_m": most}
         texts.append(
             f"{bad.sum()} of {fit.num + bad.sum()} contradict the photos, by up to {most:.1f} m ({some(names, 3)})"

@@ -13,7 +13,7 @@ _HIGH_COST_PX = 1.5
 
 
 def large_median(case: Recorded) -> Diagnosis | None:
-    """Large errors, few that fit, or start values that nothing fits: wrong focal length, mixed cameras, corrupt edges."""
+    """Large errors, or start values that nothing fits: wrong focal length, mixed cameras, corrupt edges."""
     done = case.done
     failed = case.stopped is not None and case.stopped.name in ("start", "adjust") and done.tracks is not None
     median_px = None if done.adjust is None else done.adjust.median_px

@@ -42,7 +42,9 @@ def far_off(case: Recorded) -> Diagnosis | None:
     """Positions hundreds of metres off: axis order or a wrong zone."""
     if case.stopped is not None and case.stopped.name == "crs":
         target = case.done.settings["crs"].target_crs
-        return _does_not_fit(case, target) if target is not None else None
+        diagnosis = _does_not_fit(case, target) if target is not None else None
+        if diagnosis is not None:
+            return diagnosis
     found = _against_tags(case)
     if found is None or not np.median(found.away_m) > _FAR_M:
         return None

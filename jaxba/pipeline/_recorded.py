@@ -45,9 +45,13 @@ def recorded(folder: Path) -> Recorded:
     done = Done(files=(), settings=settings, **read_lists(given))
     failed: dict[str, tuple[Left, ...]] = {}
     stale = None
+    summary = project.read_json(SUMMARY)
+    ended = summary if isinstance(summary, dict) and stage_now is None else {}
+    stopped = ended.get("stopped")
+    last = stopped["stage"] if isinstance(stopped, dict) else stage_now
     for stage in STAGES:
         if stage.name == "metadata":  # its inputs are the files, which may have moved since
-            if _store.read_record(project.stage(stage.name)) is None:
+            if last == "metadata" or _store.read_record(project.stage(stage.name)) is None:
                 break
             done.metadata = _store.load(project.stage(stage.name), stage.module.Outputs)
             continue
@@ -57,13 +61,10 @@ def recorded(folder: Path) -> Recorded:
             break
         outputs, failed[stage.name] = collected(stage, done, items)
         setattr(done, stage.name, outputs)
-    summary = project.read_json(SUMMARY)
-    ended = summary if isinstance(summary, dict) and stage_now is None else {}
     for entry in ended.get("left_out", ()):  # a worker that died leaves no record
         others = failed.get(entry["stage"], ())
         if entry["stage"] in ("features", "match") and entry["name"] not in {left.name for left in others}:
             failed[entry["stage"]] = (*others, Left(name=entry["name"], reason=entry["reason"]))
-    stopped = ended.get("stopped")
     return Recorded(
         done=done,
         stopped=Left(name=stopped["stage"], reason=stopped["reason"]) if isinstance(stopped, dict) else None,

@@ -1,5 +1,6 @@
 """Diagnosis: each fault, planted in a simulated survey, is found by its own rule; a clean survey has none."""
 
+import contextlib
 import dataclasses
 import json
 import shutil
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 from small_survey import NUM_PHOTOS, Survey, repaint
 
@@ -27,10 +29,8 @@ FOCAL_PX = 540  # of the small survey
 
 def found(survey: Survey, *changes: str, until: str | None, geotags: Path | None = None) -> dict[str, Diagnosis]:
     """Run a survey as far as it goes, and return what is diagnosed."""
-    try:
+    with contextlib.suppress(JaxbaError):  # diagnosis is for runs that stop, too
         survey.run(*changes, until=until, geotags=geotags)
-    except JaxbaError:
-        pass  # diagnosis is for runs that stop, too
     return {diagnosis.name: diagnosis for diagnosis in diagnose(survey.project)}
 
 
@@ -42,6 +42,11 @@ def places(survey: Survey) -> list[tuple[str, float, float, float]]:
     """Name, longitude, latitude and height of each photo's tags."""
     positions = [(photo.name, photo.position) for photo in recorded(survey.project).done.photos]
     return [(name, p.x, p.y, p.z_m) for name, p in positions]
+
+
+def in_utm(rows: list[tuple[str, float, float, float]]) -> list[tuple[str, float, float, float]]:
+    way = Transformer.from_crs("EPSG:4326", "EPSG:32615", always_xy=True)
+    return [(name, *way.transform(x, y), z) for name, x, y, z in rows]
 
 
 def geo_txt(path: Path, crs: str, rows: list[tuple[str, float, float, float]]) -> Path:
@@ -106,7 +111,7 @@ def test_photos_from_one_place_are_degenerate(made: Survey, tmp_path: Path):
         repaint(path, lambda a, warp=warp: cv2.warpPerspective(source, warp, (640, 480)))
     diagnosis = found(survey, until="tracks")["degenerate geometry"]
     assert diagnosis.figures["narrow_pairs"] > 0.5 * diagnosis.figures["pairs"]
-    assert "taken from one place" in diagnosis.cause and "SIM_0001.JPG" in diagnosis.cause
+    assert "taken from one place" in diagnosis.cause and "The pairs: SIM_0" in diagnosis.cause
 
 
 def test_a_wrong_focal_length_is_at_its_bound_with_large_errors(made: Survey, tmp_path: Path):
@@ -128,21 +133,16 @@ def test_a_solver_out_of_steps_with_a_high_cost_speaks_of_bad_input(made: Survey
 
 
 def test_swapped_axes_are_told_from_the_tags(made: Survey, tmp_path: Path):
-    survey = made.copy(tmp_path)
-    rows = [(name, y, x, z) for name, x, y, z in places(made)]
-    result = found(survey, until="crs", geotags=geo_txt(tmp_path / "geo.txt", "EPSG:4326", rows))
+    rows = [(name, y, x, z) for name, x, y, z in in_utm(places(made))]
+    result = found(made.copy(tmp_path), until="crs", geotags=geo_txt(tmp_path / "geo.txt", "EPSG:32615", rows))
     assert (
         "its axes are swapped" in result["far off"].cause and "x (longitude, east) before y" in result["far off"].cure
     )
 
 
 def test_a_wrong_zone_of_the_list_is_named(made: Survey, tmp_path: Path):
-    from pyproj import Transformer
-
-    to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32615", always_xy=True)
-    survey = made.copy(tmp_path)
-    rows = [(name, *to_utm.transform(x, y), z) for name, x, y, z in places(made)]
-    result = found(survey, until="crs", geotags=geo_txt(tmp_path / "geo.txt", "EPSG:32616", rows))
+    geotags = geo_txt(tmp_path / "geo.txt", "EPSG:32616", in_utm(places(made)))
+    result = found(made.copy(tmp_path), until="crs", geotags=geotags)
     assert "EPSG:32615 fits" in result["far off"].cause
 
 
@@ -174,8 +174,9 @@ def test_altitudes_that_climb_in_one_flight(tmp_path: Path):
         tags = PhotoTags(
             make="jaxba", model="simulated", time=f"2024:06:01 10:00:{k:02d}", focal_mm=11.06, focal_35mm=29,
             sensor_width_mm=13.2, latitude_deg=44.9 + 1e-4 * (k % 4), longitude_deg=-93.2 + 1e-4 * (k // 4),
-            altitude_m=320 + 7.0 * k, relative_altitude_m=70.0, gimbal=Attitude(yaw_deg=0, pitch_deg=-90, roll_deg=0),
-            flight=Attitude(yaw_deg=0, pitch_deg=0, roll_deg=0), std_h_m=1.0, std_v_m=2.0, is_rtk=False,
+            altitude_m=320 + 7.0 * k, relative_altitude_m=70.0, std_h_m=1.0, std_v_m=2.0, is_rtk=False,
+            gimbal=Attitude(yaw_deg=0.0, pitch_deg=-90.0, roll_deg=0.0),
+            flight=Attitude(yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0),
         )  # fmt: skip
         pixels[0, 0] = k
         (folder / f"P{k:02d}.JPG").write_bytes(jpeg_with_tags(pixels, tags))

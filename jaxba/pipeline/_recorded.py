@@ -19,7 +19,8 @@ class Recorded:
     - `done`: what the stages recorded, those that come before the first one without a record; its `files` are empty.
     - `stopped`: the stage in which the run ended with an error, and the error; None where it did not.
     - `killed`: the stage in which it was killed; None where it was not. `running`: who works on it now, else None.
-    - `stale`: the first stage whose record was made from other inputs or parameters, or by other code; else None.
+    - `stale`: the first stage whose record was made from other inputs or parameters, or by other code; else
+      None. The export does not count: nothing is judged by it.
     - `failed`: photos of which a stage could make nothing, by stage: also those whose worker died.
     """
 
@@ -57,7 +58,7 @@ def recorded(folder: Path) -> Recorded:
             continue
         items = [item for item in works(project, stage, done, settings[stage.name]) if item.record is not None]
         if not items:
-            stale = stage.name if project.stage(stage.name).exists() else None
+            stale = stage.name if stage.name != "export" and project.stage(stage.name).exists() else None
             break
         outputs, failed[stage.name] = collected(stage, done, items)
         setattr(done, stage.name, outputs)

@@ -50,27 +50,31 @@ def test_an_item_whose_worker_is_killed_from_outside_is_tried_again(tmp_path: Pa
     assert outcomes(killed_once, todo, Resources(workers=2)) == {str(n): (2 * n, None) for n in range(3)}
 
 
-def test_no_item_is_lost_while_workers_are_killed_again_and_again(tmp_path: Path):
+def test_no_item_is_lost_while_workers_are_killed_again_and_again():
     """The killer hits working and idle workers, and such as have just begun; a pool may break and is replaced."""
-    todo = [Item(name=str(n), arguments=(tmp_path, n), need_bytes=1e8) for n in range(60)]
-    stop, kills = threading.Event(), []
+    todo = [Item(name=str(n), arguments=(n,), need_bytes=1e8) for n in range(60)]
+    stop, kills, found = threading.Event(), [], {}
 
     def kill() -> None:
-        while not stop.wait(0.4):
+        seen = 0
+        while not stop.wait(0.2):
             alive = [child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline())]
-            if len(kills) < 8 and alive and any(tmp_path.iterdir()):
+            if alive and len(found) > seen and len(kills) < 8:  # an item has ended since
+                seen = len(found)
                 kills.append(alive[len(kills) % len(alive)].pid)
                 os.kill(kills[-1], signal.SIGKILL)
 
     killer = threading.Thread(target=kill)
     killer.start()
     try:
-        found = outcomes(double_slowly, todo, Resources(workers=2))
+        for item, result, reason in work(double_slowly, todo, Resources(workers=2)):
+            assert item.name not in found
+            found[item.name] = (result, reason)
     finally:
         stop.set()
         killer.join()
-    lost = {name: reason for name, (_, reason) in found.items() if reason}
-    assert len(kills) >= 3 and len(lost) <= 1  # an item may be hit twice
+    lost = {name for name, (_, reason) in found.items() if reason}
+    assert len(kills) >= 3 and len(found) == len(todo) and len(lost) <= 1  # an item may be hit twice
     assert all(found[name] == (2 * int(name), None) for name in found if name not in lost)
 
 

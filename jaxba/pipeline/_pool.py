@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -32,6 +33,7 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VE
 _AHEAD = 2  # items given out a worker, so that none waits for its next one
 _MOST_BROKEN = 3  # pools in a row that break before an item ended
 _LOOK_S = 0.5
+_STUCK_S = 180.0  # beyond the time limit: a worker was killed as it held the lock on the others
 _OPENCV_NO_MEMORY = -4
 _DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux
 
@@ -105,7 +107,8 @@ def _worked(
 ) -> Iterator[tuple[Item, _Ended]]:
     """Yield how each item ended, as they do.
 
-    A pool breaks when a worker is killed between two items. Items it had not ended are given to a new one.
+    A pool breaks, or no longer moves, when a worker is killed between two items. Items that it had not ended are given
+    to a new one.
     """
     waiting, broken = deque(items), 0
     limit = resources.memory_bytes / max(count, 1)
@@ -117,7 +120,8 @@ def _worked(
             )
         broken += 1
         given: dict[Future, Item] = {}
-        with _pool(count, max(limit, max(item.need_bytes for item in waiting))) as pool:
+        ended_s = time.monotonic()
+        with _pool(call, count, max(limit, max(item.need_bytes for item in waiting))) as pool:
             while (waiting or given) and pool.active:
                 while waiting and len(given) < _AHEAD * count:
                     item = waiting.popleft()
@@ -131,8 +135,11 @@ def _worked(
                 for future in wait(given, timeout=_LOOK_S, return_when=FIRST_COMPLETED).done:
                     if isinstance(future.exception(), BrokenProcessPool):
                         continue
-                    item, broken = given.pop(future), 0
+                    item, broken, ended_s = given.pop(future), 0, time.monotonic()
                     yield item, _ended(future, resources.seconds_for(item.effort))
+                longest = max((resources.seconds_for(item.effort) for item in given.values()), default=0.0)
+                if time.monotonic() - ended_s > longest + _STUCK_S:
+                    pool.stop()
         waiting.extendleft(reversed(given.values()))
 
 
@@ -170,14 +177,14 @@ def _gb(count: float) -> str:
 
 
 @contextlib.contextmanager
-def _pool(count: int, limit_bytes: float) -> Iterator[ProcessPool]:
+def _pool(call: Callable[..., Any], count: int, limit_bytes: float) -> Iterator[ProcessPool]:
     """A pool of workers; when the block is left by an error they are stopped in the middle of their work."""
     with _one_thread_each():  # a worker may start at any time
         pool = ProcessPool(
             max_workers=count,
             context=get_context("spawn"),
             initializer=_prepare_worker,
-            initargs=(int(limit_bytes),),
+            initargs=(int(limit_bytes), call),
         )
         try:
             pool.active  # noqa: B018  starts it
@@ -223,7 +230,8 @@ def _lacks_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
 
 
-def _prepare_worker(limit_bytes: int) -> None:
+def _prepare_worker(limit_bytes: int, call: Callable[..., Any]) -> None:
+    """Limit a worker; it gets `call` so that what that imports is loaded before the worker locks the others out."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if sys.platform == "linux":

@@ -52,14 +52,14 @@ def test_an_item_whose_worker_is_killed_from_outside_is_tried_again(tmp_path: Pa
 
 def test_no_item_is_lost_while_workers_are_killed_again_and_again():
     """The killer hits working and idle workers, and such as have just begun; a pool may break and is replaced."""
-    todo = [Item(name=str(n), arguments=(n,), need_bytes=1e8) for n in range(60)]
+    todo = [Item(name=str(n), arguments=(n,), need_bytes=1e8) for n in range(30)]
     stop, kills, found = threading.Event(), [], {}
 
     def kill() -> None:
         seen = 0
         while not stop.wait(0.2):
             alive = [child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline())]
-            if alive and len(found) > seen and len(kills) < 8:  # an item has ended since
+            if alive and len(found) > seen and len(kills) < 4:  # an item has ended since
                 seen = len(found)
                 kills.append(alive[len(kills) % len(alive)].pid)
                 os.kill(kills[-1], signal.SIGKILL)

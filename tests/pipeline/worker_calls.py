@@ -49,8 +49,8 @@ def killed_once(marks: Path, number: int) -> int:
 
 
 def double_slowly(number: int) -> int:
-    """Double a number in 50 ms."""
-    time.sleep(0.05)
+    """Double a number in 0.2 s."""
+    time.sleep(0.2)
     return 2 * number
 
 

@@ -7,6 +7,11 @@ fine photos with much overlap. What is unknown counts against ORB.
 Ground sample distance: height above ground over focal length in pixels, of the photos as they are given; the median
 of the photos that have both. Overlap: the median over photos of the largest overlap with any other photo, which is the
 forward overlap of a flight in lines, from the footprints of the pairs stage.
+
+Measured (`python -m benchmarks.detectors`): ORB adjusts the same photos with the same fit to GNSS, at 0.25 to 0.29 px
+where SIFT has 0.10 to 0.20, with half of its points seen three times over forest and field and four fifths in a
+simulated survey of 4 cm/px and 80% overlap, which `auto` gives to ORB. Its features take a fifth of the time, its
+matches more: in all 0.9 to 1.1 times SIFT's processor time, and 3 times where a third of the pairs fall back to SIFT.
 """
 
 from dataclasses import dataclass

@@ -64,7 +64,7 @@ def test_each_stage_that_ran_has_its_lines_none_twice_and_none_too_wide(cli: Cli
     survey = made.copy(tmp_path)
     code, out, _ = cli("run", survey.photos, "--out", survey.project, *FLAGS, "--crs", "EPSG:6344")
     lines = out.splitlines()
-    assert code == 0 and [line.split()[0] for line in lines if line[:1].strip()][:2] == ["crs", "export"]
+    assert code == 0 and [line.split()[0] for line in lines if line[:1].strip()][:3] == ["crs", "control", "export"]
     assert max(map(len, lines)) <= 120
     sentences = " ".join(out.split()).split(". ")
     assert sum(sentence.startswith("Heights are metres above") for sentence in sentences) == 1

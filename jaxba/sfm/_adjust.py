@@ -241,7 +241,7 @@ class _Rounds:
         scale = position_scale(block, self.reference)
         scale_of_control = None
         if is_later and self.control.num_points:
-            is_free = used_positions(block, self.reference).sum() < LEAST_TO_PLACE
+            is_free = int(used_positions(block, self.reference).sum()) < LEAST_TO_PLACE
             scale_of_control = control_scale(block, self.control, mark_used, is_free=is_free)
         control = control_part(block, self.control, mark_used, scale_of_control)
         offset_m = gnss_offset(block, self.reference, control)

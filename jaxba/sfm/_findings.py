@@ -164,6 +164,8 @@ def _outliers(block: Block, fit: GnssFit, photos: Sequence[Photo]) -> list[str]:
 def _scatter(adjusted: Adjusted, reference: Reference, fit: GnssFit) -> list[str]:
     """Axes in which residuals are over 1.5 times their sigmas, and more than chance makes them (chi-square, 0.1%)."""
     index = adjusted.block.image_index
+    if not used_positions(adjusted.block, reference).any():
+        return []
     stated = np.median(reference.std_m[index[used_positions(adjusted.block, reference)]], axis=0)
     ratio = np.where(fit.is_outlier[:, None], np.nan, fit.residual_m / reference.std_m[index])
     known = np.count_nonzero(np.isfinite(ratio), axis=0)

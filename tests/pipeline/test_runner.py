@@ -100,7 +100,7 @@ def test_another_target_crs_reruns_crs_and_export_alone(made: Survey, tmp_path: 
     survey = made.copy(tmp_path)
     before = exported(survey.project)
     run = survey.run("crs.target_crs=EPSG:6344")  # NAD83(2011) / UTM zone 15N
-    assert run.stages_run == ("crs", "export")
+    assert run.stages_run == ("crs", "control", "export")
     assert summary(run)["crs"]["epsg"] == 6344
     assert exported(survey.project)["cloud.laz"] != before["cloud.laz"]
 

@@ -1,0 +1,245 @@
+"""Control points in the adjustment and in fits after it: against the truth, with blunders, without heights or GNSS."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated import Simulated, simulate, true_block
+
+from jaxba.ba import make_plan
+from jaxba.scene import Control
+from jaxba.sfm import (
+    Adjusted,
+    Settings,
+    adjust,
+    apply_control,
+    control_findings,
+    place_by_control,
+    to_problem,
+    uncertainty as uncertainty_of,
+    with_points,
+)
+from jaxba.sfm._align import Similarity
+from jaxba.sfm._control import agreeing_marks, control_part, control_scale, intersect
+from jaxba.sfm._control_fit import Controlled, apply_affine, fit_affine
+from jaxba.sfm._control_start import transformed
+
+OFFSET_M = np.array([12.0, -7.0, 31.0])
+SETTINGS = Settings(max_rounds=3)
+
+
+@pytest.fixture(scope="module")
+def survey() -> Simulated:
+    """GNSS with a noise of 3 m, and as much off in common as another datum makes."""
+    found = simulate(12, seed=4, points_per_image=60.0, gnss_std_m=(3.0, 3.0, 5.0))
+    return replace(found, reference=replace(found.reference, xyz_m=found.reference.xyz_m + OFFSET_M))
+
+
+@pytest.fixture(scope="module")
+def points(survey: Simulated) -> Control:
+    """Six control and four check points, spread over the block, in photos that show them."""
+    truth, seen = survey.survey.truth, survey.survey.problem.observations
+    point, image = np.asarray(seen.point_index), np.asarray(seen.image_index)
+    often = np.flatnonzero(np.bincount(point, minlength=len(truth.points)) >= 5)
+    chosen = [often[0]]
+    while len(chosen) < 10:  # the farthest from those before
+        away = np.linalg.norm(truth.points[often, None] - truth.points[chosen], axis=2).min(axis=1)
+        chosen.append(often[np.argmax(away)])
+    rng = np.random.default_rng(1)
+    rows = np.concatenate([np.flatnonzero(point == p) for p in chosen])
+    std_m = np.tile([0.02, 0.02, 0.03], (10, 1))
+    return Control(
+        names=tuple(f"gcp{k}" for k in range(10)),
+        xyz_m=truth.points[chosen] + std_m / 2 * rng.normal(size=(10, 3)),
+        std_m=std_m,
+        is_check=np.arange(10) % 3 == 2,
+        mark_point=np.array([chosen.index(p) for p in point[rows]]),
+        mark_image=image[rows].astype(np.int64),
+        mark_xy_px=truth.xy_px[rows] + 0.5 * rng.normal(size=(len(rows), 2)),
+    )
+
+
+def moved(control: Control, row: int, by_m: list[float]) -> Control:
+    xyz_m = control.xyz_m.copy()
+    xyz_m[row] += by_m
+    return replace(control, xyz_m=xyz_m)
+
+
+def without_heights(control: Control) -> Control:
+    return replace(control, std_m=np.where([True, True, False], control.std_m, np.inf))
+
+
+def run(survey: Simulated, control: Control) -> tuple[Adjusted, Controlled]:
+    block = with_points(survey.block, survey.tracks, min_angle_rad=0.02, max_error_px=20.0)
+    block = place_by_control(block, control.without_check_points())
+    adjusted = adjust(
+        block, survey.tracks, survey.view_graph, survey.reference, survey.photos, SETTINGS, control=control
+    )
+    sigmas = uncertainty_of(adjusted, survey.reference)
+    return adjusted, apply_control(adjusted, sigmas, control, survey.reference)
+
+
+def told(survey: Simulated, control: Control, made: tuple[Adjusted, Controlled]) -> str:
+    return " ".join(control_findings(made[0], control, made[1].fit, survey.reference, survey.photos))
+
+
+@pytest.fixture(scope="module")
+def made(survey: Simulated, points: Control) -> tuple[Adjusted, Controlled]:
+    return run(survey, points)
+
+
+def test_check_points_lie_where_they_were_surveyed_though_gnss_is_metres_off(
+    survey: Simulated, points: Control, made: tuple[Adjusted, Controlled]
+) -> None:
+    fit = made[1].fit
+    assert fit.method == "adjust" and (fit.num_marks >= 5).all()
+    assert (fit.control_rms_m < 0.03).all() and (fit.check_rms_m < [0.04, 0.04, 0.08]).all()
+    over = fit.residual_m / np.hypot(fit.std_m, points.std_m)
+    assert np.abs(over).max() < 4 and not fit.is_suspect.any() and (fit.scale == 1).all()
+    centers = np.asarray(survey.survey.truth.poses.center)
+    assert np.abs(made[1].block.centers_m - centers).max() < 0.15
+    none = run(survey, replace(points, method="none"))[1].fit
+    assert none.method == "none" and (np.abs(none.check_rms_m) > 3).all()
+
+
+def test_an_offset_of_gnss_from_control_is_told_and_does_not_pull(
+    survey: Simulated, points: Control, made: tuple[Adjusted, Controlled]
+) -> None:
+    fit = made[1].fit
+    np.testing.assert_allclose(fit.gnss_minus_control_m, OFFSET_M, atol=4.0)  # medians of 12 with 3 and 5 m
+    np.testing.assert_allclose(made[0].gnss_offset_m, -fit.gnss_minus_control_m, atol=0.3)
+    text = told(survey, points, made)
+    assert "GNSS positions minus the block as control places it" in text and "contradicts" not in text
+
+
+def test_check_points_change_nothing(survey: Simulated, points: Control, made: tuple[Adjusted, Controlled]) -> None:
+    wrong = points
+    for row in np.flatnonzero(points.is_check):
+        wrong = moved(wrong, int(row), [5.0, 5.0, 5.0])
+    other = run(survey, wrong)
+    assert np.array_equal(other[1].block.centers_m, made[1].block.centers_m)
+    assert np.array_equal(other[1].block.points_m, made[1].block.points_m)
+    assert other[1].fit.check_rms_m[0] > 4
+
+
+def test_a_control_point_that_is_off_by_a_metre_is_named_and_hardly_pulls(
+    survey: Simulated, points: Control, made: tuple[Adjusted, Controlled]
+) -> None:
+    wrong = moved(points, 3, [0.8, 0.6, 0.0])
+    other = run(survey, wrong)
+    assert [wrong.names[k] for k in np.flatnonzero(other[1].fit.is_suspect)] == ["gcp3"]
+    assert np.abs(other[1].fit.residual_m[3] + [0.8, 0.6, 0.0]).max() < 0.15
+    assert np.abs(other[1].block.centers_m - made[1].block.centers_m).max() < 0.2
+    assert "Control point gcp3 contradicts the block" in told(survey, wrong, other)
+
+
+@pytest.mark.parametrize("method", ["helmert", "affine"])
+def test_a_fit_afterwards_brings_the_block_onto_control(survey: Simulated, points: Control, method: str) -> None:
+    control = replace(points, method=method)
+    adjusted, found = run(survey, control)
+    assert adjusted.control is None and not adjusted.gnss_offset_m.any() and found.fit.method == method
+    assert (found.fit.control_rms_m < [0.1, 0.1, 0.3]).all() and (found.fit.check_rms_m < [0.1, 0.1, 0.3]).all()
+    assert np.isnan(found.sigmas.position_std_m).all() and "method=adjust" in (found.sigmas.why_not or "")
+    points_m = apply_affine(found.affine, found.block.points_m)
+    truth = survey.survey.truth.points[found.block.track_index]
+    assert np.median(np.linalg.norm(points_m - truth, axis=1)) < 0.3
+    assert np.array_equal(found.affine, np.eye(3, 4)) == (method == "helmert")
+    wrong = replace(moved(points, 3, [1.5, 1.0, 0.0]), method=method)
+    assert apply_control(adjusted, found.sigmas, wrong, survey.reference).fit.is_suspect[3]
+
+
+def test_wrong_marks_are_told_where_the_others_agree(survey: Simulated, points: Control) -> None:
+    block = true_block(survey)
+    assert agreeing_marks(block, points).all()
+    xy_px = points.mark_xy_px.copy()
+    xy_px[[2, 30]] += [[60.0, -40.0], [0.0, 300.0]]
+    use = agreeing_marks(block, replace(points, mark_xy_px=xy_px))
+    assert np.flatnonzero(~use).tolist() == [2, 30]
+    first = np.flatnonzero(points.mark_point == 0)
+    two = replace(points, mark_point=points.mark_point[first[:2]], mark_image=points.mark_image[first[:2]],
+                  mark_xy_px=xy_px[[first[0], 2]])  # fmt: skip
+    assert agreeing_marks(block, two).all()  # which of two is wrong nobody can tell
+
+
+def test_a_survey_that_contradicts_as_a_whole_gets_the_sigmas_that_it_shows(survey: Simulated, points: Control) -> None:
+    block = true_block(survey)
+    use = np.ones(len(points.mark_point), bool)
+    assert control_scale(block, points, use, is_free=False).tolist() == [1.0, 1.0]
+    assert control_scale(block, moved(points, 3, [9.0, 9, 9]), use, is_free=False).tolist() == [1.0, 1.0]
+    noise = np.random.default_rng(2).normal(size=(10, 3)) * [1.5, 1.5, 0.0]
+    scale = control_scale(block, replace(points, xyz_m=points.xyz_m + noise), use, is_free=False)
+    assert 30 < scale[0] < 150 and scale[1] == 1.0  # 1.5 m over 0.02 m: 75
+
+
+def test_control_places_a_block_of_any_frame(survey: Simulated, points: Control) -> None:
+    truth = survey.survey.truth
+    free = with_points(true_block(survey), survey.tracks, min_angle_rad=0.02, max_error_px=20.0)
+    turn = Similarity(scale=0.02, rotation=Rotation.from_rotvec([0.3, -0.2, 2.0]).as_matrix(), shift=np.ones(3))
+    free = replace(transformed(free, turn), is_georeferenced=False)
+    centers = np.asarray(truth.poses.center)
+    wrong = moved(points, 0, [40.0, 0.0, 0.0])
+    for control in (points, wrong):
+        placed = place_by_control(free, control.without_check_points())
+        assert placed.is_georeferenced and np.abs(placed.centers_m - centers).max() < (
+            1.0 if control is points else 4.0
+        )
+    flat = place_by_control(free, without_heights(points).without_check_points())
+    assert flat.is_georeferenced and "tilt" in flat.notes[-1]
+    assert np.abs(flat.centers_m - centers)[:, :2].max() < 8.0  # the photos look down on average, and control is flat
+    two = replace(points, is_check=np.arange(10) > 1)
+    kept = place_by_control(free, two.without_check_points())
+    assert not kept.is_georeferenced and "2 are marked" in kept.notes[-1]
+
+
+def test_horizontal_control_leaves_heights_to_gnss(survey: Simulated, points: Control) -> None:
+    control = without_heights(points)
+    adjusted, found = run(survey, control)
+    assert np.isnan(found.fit.residual_m[:, 2]).all() and (found.fit.check_rms_m[:2] < 0.1).all()
+    assert np.isnan(found.fit.gnss_minus_control_m[2]) and adjusted.gnss_offset_m[2] == 0
+    up = np.median(found.block.centers_m[:, 2] - survey.reference.xyz_m[:, 2])
+    assert abs(up) < 3.0  # GNSS of 5 m, 12 of them
+
+
+def test_points_and_marks_stand_behind_the_blocks_own(survey: Simulated, points: Control) -> None:
+    block = with_points(survey.block, survey.tracks, min_angle_rad=0.02, max_error_px=20.0)
+    part = control_part(block, points, np.ones(len(points.mark_point), bool))
+    assert part is not None and part.rows.tolist() == [0, 1, 3, 4, 6, 7, 9]
+    plain = to_problem(block, survey.reference, survey.photos, std_px=0.4)
+    problem = to_problem(block, survey.reference, survey.photos, std_px=0.4, control=part)
+    extra = len(part.observation_image)
+    assert problem.num_points == block.num_points + 7 and problem.num_observations == block.num_observations + extra
+    assert np.array_equal(problem.points[: block.num_points], plain.points)
+    assert set(problem.observations.std_px[-extra:]) == {1.0} and set(plain.observations.std_px) == {0.4}
+    prior = problem.prior("control")
+    assert prior is not None and plain.prior("control") is None
+    np.testing.assert_array_equal(prior.xyz, points.xyz_m[part.rows])  # pyright: ignore[reportAttributeAccessIssue]
+    assert control_part(block, replace(points, method="helmert"), np.ones(len(points.mark_point), bool)) is None
+
+
+def test_a_mark_less_compiles_nothing_anew(survey: Simulated, points: Control) -> None:
+    block = with_points(survey.block, survey.tracks, min_angle_rad=0.02, max_error_px=20.0)
+    use = np.ones(len(points.mark_point), bool)
+    full = make_plan(to_problem(block, survey.reference, survey.photos, control=control_part(block, points, use)))
+    use[3] = False
+    less = to_problem(block, survey.reference, survey.photos, control=control_part(block, points, use))
+    assert make_plan(less, like=full.shape).shape == full.shape
+
+
+def test_intersection_is_least_squares_of_pixels(survey: Simulated, points: Control) -> None:
+    block = true_block(survey)
+    found = intersect(block, points, np.ones(len(points.mark_point), bool))
+    off = (found.point_m - points.xyz_m) / np.sqrt(found.variance_m2 / 4 + points.std_m**2 / 4)
+    assert 0.5 < np.sqrt(np.mean(off**2)) < 1.5  # marks and survey have half of their sigmas
+
+
+def test_affine_shears_only_what_points_tell() -> None:
+    rng = np.random.default_rng(0)
+    source = rng.normal(size=(12, 3)) * [50, 50, 10]
+    true = np.array([[1.001, 0.002, 0.0, 5.0], [0.0, 0.999, 0.001, -3.0], [0.003, 0.0, 1.002, 1.0]])
+    found = fit_affine(source, apply_affine(true, source), np.full((12, 3), 0.01))
+    np.testing.assert_allclose(found, true, atol=2e-5)
+    flat = source * [1, 1, 0]
+    held = fit_affine(flat, apply_affine(true, flat), np.full((12, 3), 0.01))
+    np.testing.assert_allclose(held[:, 2], [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(held[:, [0, 1, 3]], true[:, [0, 1, 3]], atol=2e-5)

@@ -39,13 +39,23 @@ class Survey:
         *changes: str,
         until: str | None = None,
         geotags: Path | None = None,
+        gcp: Path | None = None,
+        check: Path | None = None,
         workers: int = 2,
         tell: Callable[[Event], None] = lambda event: None,
     ) -> Run:
         settings = changed(default_settings(), [*FAST, *changes])
         resources = Resources(workers=workers)
         return run_pipeline(
-            self.photos, self.project, settings, until=until, geotags=geotags, resources=resources, tell=tell
+            self.photos,
+            self.project,
+            settings,
+            until=until,
+            geotags=geotags,
+            gcp=gcp,
+            check=check,
+            resources=resources,
+            tell=tell,
         )
 
 

@@ -98,7 +98,8 @@ def test_check_points_lie_where_they_were_surveyed_though_gnss_is_metres_off(
     over = fit.residual_m / np.hypot(fit.std_m, points.std_m)
     assert np.abs(over).max() < 4 and not fit.is_suspect.any() and (fit.scale == 1).all()
     centers = np.asarray(survey.survey.truth.poses.center)
-    assert np.abs(made[1].block.centers_m - centers).max() < 0.15
+    # heights of cameras trade off with the focal length over flat ground; those of points do not
+    assert (np.abs(made[1].block.centers_m - centers).max(axis=0) < [0.15, 0.15, 1.5]).all()
     none = run(survey, replace(points, method="none"))[1].fit
     assert none.method == "none" and (np.abs(none.check_rms_m) > 3).all()
 
@@ -130,7 +131,8 @@ def test_a_control_point_that_is_off_by_a_metre_is_named_and_hardly_pulls(
     other = run(survey, wrong)
     assert [wrong.names[k] for k in np.flatnonzero(other[1].fit.is_suspect)] == ["gcp3"]
     assert np.abs(other[1].fit.residual_m[3] + [0.8, 0.6, 0.0]).max() < 0.15
-    assert np.abs(other[1].block.centers_m - made[1].block.centers_m).max() < 0.2
+    pulled = np.abs(other[1].fit.adjusted_m - made[1].fit.adjusted_m)
+    assert np.delete(pulled, 3, axis=0)[:, :2].max() < 0.1
     assert "Control point gcp3 contradicts the block" in told(survey, wrong, other)
 
 

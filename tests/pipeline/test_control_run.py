@@ -1,0 +1,78 @@
+"""A whole run with control and check points: what is rerun, what the files and the summary say, the truth."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_survey import Survey
+
+from jaxba._errors import JaxbaError
+from jaxba.io import read_tile
+from jaxba.pipeline import summary
+from jaxba.pipeline._control_summary import control_rows
+from jaxba.pipeline._events import Run
+
+
+@pytest.fixture(scope="module")
+def survey(made: Survey, tmp_path_factory: pytest.TempPathFactory) -> Survey:
+    return made.copy(tmp_path_factory.mktemp("control"))
+
+
+@pytest.fixture(scope="module")
+def run(survey: Survey) -> Run:
+    lists = survey.photos.parent
+    return survey.run(gcp=lists / "gcp_list.txt", check=lists / "check_list.txt")
+
+
+def rows_of(survey: Survey) -> list[dict[str, str]]:
+    with open(survey.project / "export" / "control.csv", encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_lists_rerun_what_uses_them_and_nothing_before(run: Run, survey: Survey) -> None:
+    assert run.stages_run == ("control", "start", "adjust", "export")
+    lists = survey.photos.parent
+    again = survey.run(gcp=lists / "gcp_list.txt", check=lists / "check_list.txt", workers=1)
+    assert again.stages_run == ()
+
+
+def test_points_lie_where_the_truth_has_them(run: Run, survey: Survey) -> None:
+    truth = np.load(survey.photos.parent / "truth.npz")
+    where = dict(zip(truth["target_name"].tolist(), truth["target_in_crs_m"], strict=True))
+    rows = rows_of(survey)
+    assert [row["role"] for row in rows].count("check") == 5 and len(rows) == len(where)
+    off = np.array([[float(row[f"adjusted_{a}"]) for a in "xyz"] - where[row["name"]] for row in rows])
+    std = np.array([[float(row[f"std_{a}_m"]) for a in ("east", "north", "up")] for row in rows])
+    assert np.abs(off / std).max() < 3.5 and np.sqrt(np.mean(off**2)) < 0.06
+    assert {row["suspect"] for row in rows} == {"no"} and all(float(row["mark_rms_px"]) < 1.5 for row in rows)
+
+
+def test_summary_and_terminal_tell_control_and_check_apart(run: Run) -> None:
+    facts = summary(run)["control"]
+    assert facts["method"] == "adjust" and facts["control"]["num"] == facts["check"]["num"] == 5
+    assert {point["role"] for point in facts["points"]} == {"control", "check"}
+    assert len(facts["gnss_minus_control_m"]) == 3 and max(map(abs, facts["gnss_minus_control_m"])) < 0.3
+    (first, control), (second, check) = control_rows(facts)
+    assert (first, second) == ("control", "check")
+    assert control.startswith("RMS 0.0") and "m east, north, up over 5 points; worst gcp" in control
+    assert "worst check" in check
+    assert not [text for text in summary(run)["adjust"]["findings"] if "ontrol" in text and "contradict" in text]
+
+
+def test_tile_holds_the_control_points_with_their_marks(run: Run, survey: Survey) -> None:
+    problem = read_tile(survey.project / "export" / "tile.npz")
+    prior = problem.prior("control")
+    assert prior is not None
+    block = run.done.adjust.block
+    assert problem.num_points == block.num_points + 5
+    marks = np.asarray(problem.observations.point_index) >= block.num_points
+    assert marks.sum() >= 10 and set(np.asarray(problem.observations.std_px)[marks]) == {1.0}
+    adjusted = run.done.adjust.control.adjusted_m[~run.done.control.control.is_check]
+    # the tile starts at the marks' intersection, the adjusted points are held by the survey too
+    np.testing.assert_allclose(np.asarray(problem.points)[block.num_points :], adjusted, atol=0.1)
+
+
+def test_a_list_that_is_not_there_is_named(survey: Survey, tmp_path: Path) -> None:
+    with pytest.raises(JaxbaError, match=r"none.txt: there is no such file; give a gcp_list.txt or CSV"):
+        survey.run(gcp=tmp_path / "none.txt", until="control")

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._check import Check, failed, ok

@@ -105,11 +105,11 @@ def _same_pixel(
     for k in range(len(point)):
         near = np.flatnonzero((image == image[k]) & (np.hypot(*(xy_px - xy_px[k]).T) < _ONE_PIXEL))
         for other in near[near > k].tolist():
-            one, two = points[point[k]], points[point[other]]
+            one, two = points[int(point[k])], points[int(point[other])]
             if (one.x, one.y) != (two.x, two.y):
                 found.append(
-                    f"{one.name} and {two.name} are marked at one pixel of {photos[image[k]].name} and lie apart: one "
-                    "of the marks is wrong."
+                    f"{one.name} and {two.name} are marked at one pixel of {photos[int(image[k])].name} and lie "
+                    "apart: one of the marks is wrong."
                 )
     return found
 

@@ -116,8 +116,13 @@ def _crs(done: Done) -> crs.Inputs:
 
 
 def _control(done: Done) -> control.Inputs:
-    made, lists = done.crs, {"gcp": done.gcp, "check": done.check}
-    return control.Inputs(photos=done.photos, reference=made.reference, target_crs=made.target_crs, **lists)
+    return control.Inputs(
+        photos=done.photos,
+        reference=done.crs.reference,
+        target_crs=done.crs.target_crs,
+        gcp=done.gcp,
+        check=done.check,
+    )
 
 
 def _pairs(done: Done) -> pairs.Inputs:

@@ -46,7 +46,7 @@ class Params(Parameters):
         choices=("adjust", "helmert", "affine", "none"),
         help="control in the adjustment, or a fit of 7 or 12 parameters after it, or only compared",
     )
-    check: str = parameter("", help="names of points that are check points, such as gcp03, gcp07")
+    check: str | None = parameter(None, help="names of points that are check points, such as gcp03, gcp07")
     std_h: float = parameter(0.02, low=0.001, high=10, help="sigma east and north of a point that states none, metres")
     std_v: float = parameter(0.03, low=0.001, high=20, help="sigma of its height, metres")
     mark_std_px: float = parameter(1.0, low=0.05, high=20, help="sigma of a mark an axis, px")
@@ -153,7 +153,7 @@ def _all_points(inputs: Inputs, params: Params) -> tuple[list[SurveyedPoint], li
         for point in read.points:
             joined = _joined(found[point.name], point) if point.name in found else point
             found[point.name] = dataclasses.replace(joined, is_check=joined.is_check or is_check)
-    asked = [name for name in (text.strip() for text in params.check.replace(";", ",").split(",")) if name]
+    asked = [name for name in (text.strip() for text in (params.check or "").replace(";", ",").split(",")) if name]
     unknown = [name for name in asked if name not in found]
     if unknown:
         raise JaxbaError(

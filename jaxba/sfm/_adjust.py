@@ -26,6 +26,7 @@ from jaxba.scene import Block, Control, Features, Left, Photo, Reference, Tracks
 from jaxba.sfm._complete import complete_tracks
 from jaxba.sfm._control import (
     LEAST_TO_PLACE,
+    PLAIN_M,
     ControlPart,
     agreeing_marks,
     control_part,
@@ -45,7 +46,7 @@ _SPARE = 0.03  # room for tracks that pruning cuts in two
 _START_ERROR = 0.005  # of the longer side: what start values are good to
 _FIRST_STEPS, _ROUND_STEPS = 12, 40  # before the median has settled
 _CONVERGED = 0.01
-_PLAIN_M, _LEAST_POSITIONS = 1.0, 6
+_LEAST_POSITIONS = 6
 _MAX_PRUNED = 0.3  # of the edges: more of them over the limit speak of the block, not of the edges
 _FAR = 10.0  # times the limit of an edge: no bent block explains it
 _LEAST_OBSERVATIONS = 3  # of an image: fewer do not fix a pose
@@ -244,7 +245,7 @@ class _Rounds:
             is_free = int(used_positions(block, self.reference).sum()) < LEAST_TO_PLACE
             scale_of_control = control_scale(block, self.control, mark_used, is_free=is_free)
         control = control_part(block, self.control, mark_used, scale_of_control)
-        offset_m = gnss_offset(block, self.reference, control)
+        offset_m = gnss_offset(block, self.reference, control, is_later=is_later)
         reference = with_offset(self.reference, offset_m)
         held = [name for name in CAMERAS[block.camera_model].parameter_names() if name not in free]
 
@@ -307,7 +308,7 @@ def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]
     """Return what the sigmas of positions are multiplied by, an axis, from how the positions scatter about the block.
 
     The median of |residual| over 0.6745 sigma (its value for a normal distribution), and not below 1: positions may be
-    worse than they claim. Sigmas of more than `_PLAIN_M` are those of a single receiver, mostly an offset that all
+    worse than they claim. Sigmas of more than `PLAIN_M` are those of a single receiver, mostly an offset that all
     positions of a flight have in common; their scatter alone tells their weight against each other, down to a tenth.
     Under six positions it is 1.
     """
@@ -322,7 +323,7 @@ def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]
         residual = block.centers_m[used, axis] - reference.xyz_m[index, axis]
         ratio = np.median(np.abs(residual - np.median(residual))[known] / std[known]) / 0.6745
         ratio *= np.sqrt(known.sum() / (known.sum() - 7 / 3))  # a similarity has fitted the block to them
-        scale[axis] = max(ratio, 0.1 if np.median(std[known]) > _PLAIN_M else 1.0)
+        scale[axis] = max(ratio, 0.1 if np.median(std[known]) > PLAIN_M else 1.0)
     return scale
 
 

@@ -24,8 +24,10 @@ from jaxba.sfm._rays import Rays, make_rays
 CONTROL_LOSS = Huber(3.0)
 LEAST_TO_PLACE = 3
 """Control points that place a block, and that tell an offset of GNSS positions from it."""
+PLAIN_M = 1.0
+"""Sigma of a position beyond which it is that of a single receiver."""
 _WRONG = 5.0  # sigmas of a mark
-_CONTRADICTS = 3.0  # sigmas, robust, of all control points
+_CONTRADICTS = 3.0  # sigmas: robust, of all control points; of what positions are off in common
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -191,15 +193,22 @@ def control_scale(
     return scale
 
 
-def gnss_offset(block: Block, reference: Reference, control: ControlPart | None) -> Float[np.ndarray, "3"]:
+def gnss_offset(
+    block: Block, reference: Reference, control: ControlPart | None, *, is_later: bool
+) -> Float[np.ndarray, "3"]:
     """Return what measured positions are to be moved by, an axis: zero where control does not fix the block.
 
-    The median of block minus measured position. What all positions have in common (another datum, a single receiver's
-    error, the antenna's offset) contradicts control by itself, and control is right; their scatter is what they tell.
+    The median of block minus measured position. What all positions have in common (another datum, the antenna's offset)
+    contradicts control by itself, and control is right; their scatter is what they tell. Positions of a single receiver
+    (a sigma over `PLAIN_M`) always have such an offset. Better ones hold the height and with it the focal length, so
+    they are moved only where they contradict a block that was solved with them, by three sigmas: `is_later`.
     """
-    if control is None:
+    index = block.image_index[reference.is_used[block.image_index]]
+    if control is None or not len(index):
         return np.zeros(3)
-    return np.where(control.determined, np.nan_to_num(median_offset(block, reference)), 0.0)
+    off_m, std_m = np.nan_to_num(median_offset(block, reference)), np.median(reference.std_m[index], axis=0)
+    free = (std_m > PLAIN_M) | (is_later & (np.abs(off_m) > _CONTRADICTS * std_m))
+    return np.where(control.determined & free, off_m, 0.0)
 
 
 def median_offset(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:

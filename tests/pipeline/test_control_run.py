@@ -52,7 +52,8 @@ def test_summary_and_terminal_tell_control_and_check_apart(run: Run) -> None:
     facts = summary(run)["control"]
     assert facts["method"] == "adjust" and facts["control"]["num"] == facts["check"]["num"] == 5
     assert {point["role"] for point in facts["points"]} == {"control", "check"}
-    assert len(facts["gnss_minus_control_m"]) == 3 and max(map(abs, facts["gnss_minus_control_m"])) < 0.3
+    # positions of 3 and 5 cm agree with control, and hold the block with it
+    assert len(facts["gnss_minus_control_m"]) == 3 and max(map(abs, facts["gnss_minus_control_m"])) < 0.1
     (first, control), (second, check) = control_rows(facts)
     assert (first, second) == ("control", "check")
     assert control.startswith("RMS 0.0") and "m east, north, up over 5 points; worst gcp" in control

@@ -56,7 +56,7 @@ def test_code_version_follows_imports_to_where_a_name_is_defined():
 
 
 def test_code_version_differs_by_stage_and_repeats():
-    names = ["metadata", "crs", "pairs", "features", "match", "tracks", "start", "adjust", "export"]
+    names = ["metadata", "crs", "control", "pairs", "features", "match", "tracks", "start", "adjust", "export"]
     versions = [code_version(f"jaxba.pipeline.{name}") for name in names]
     assert len(set(versions)) == len(names)
 

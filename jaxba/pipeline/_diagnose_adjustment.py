@@ -25,7 +25,7 @@ def large_median(case: Recorded) -> Diagnosis | None:
     edges = graph.is_edge
     begin = (
         f"The median reprojection error is {median_px:.2f} px and {done.adjust.inlier_rate:.0%} of the observations fit"
-        if median_px is not None
+        if done.adjust is not None
         else f"No block fits the matches (stage {case.stopped.name}: {case.stopped.reason.rstrip('.')})"
         if case.stopped
         else ""

@@ -66,9 +66,9 @@ def over_store(case: Recorded) -> Diagnosis | None:
     if case.stopped is None or case.stopped.name != "features" or case.done.pairs is None:
         return None
     resources: Resources = case.done.settings["workers"]
-    nfeatures = tune(case.done.routing.detector, (), None, nfeatures=case.done.settings["features"].nfeatures).nfeatures
-    need = store_bytes(len(case.done.photos), case.done.routing.detector, nfeatures)
-    allowed = bytes_of(resources.max_store, float("nan"))
+    detector, asked = case.done.routing.detector, case.done.settings["features"].nfeatures
+    need = store_bytes(len(case.done.photos), detector, tune(detector, (), None, nfeatures=asked).nfeatures)
+    allowed = bytes_of(resources.max_store, float("nan"))  # a share of a disk whose room has changed since says nothing
     if not need > allowed:
         return None
     return Diagnosis(

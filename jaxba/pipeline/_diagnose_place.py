@@ -1,41 +1,24 @@
 """Rules on the place: positions in another zone or with swapped axes, datums that are mixed, a GNSS that contradicts
 itself. Where a list replaces the photos' tags, the tags are read again and held against it."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
-from pyproj import CRS, Geod, Transformer
-from pyproj.exceptions import ProjError
+from pyproj import CRS
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._diagnose_adjustment import bounds_reached, has_large_errors
 from jaxba.pipeline._diagnosis import Diagnosis, some
+from jaxba.pipeline._listed import Against, against_tags, apart_m, moved, wgs84
 from jaxba.pipeline._recorded import Recorded
-from jaxba.scene import Photo, PhotoFile, Position
+from jaxba.scene import Position
 
 _FAR_M = 100.0
 _AGREES_M = 60.0  # a plain receiver with a bad day
 _DATUM_M = 8.0  # between height systems, or horizontal datums; a receiver's heights differ by less within a flight
 _STEADY = 0.3  # scatter of an offset over it: an offset in common
-_COMPARED = 20  # photos whose tags are read again
 _OUTLIERS = 0.1
 _SCATTERS = 3.0  # times the stated sigma
 _METRE = 1.0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Against:
-    """Positions of a list beside those of the same photos' tags, WGS 84.
-
-    - `listed`, `tagged`: as they are. `away_m`: horizontal distance. `up_m`: height of the list minus that of the tags.
-    """
-
-    photos: tuple[Photo, ...]
-    listed: tuple[Position, ...]
-    tagged: tuple[Position, ...]
-    away_m: Float[np.ndarray, " photos"]
-    up_m: Float[np.ndarray, " photos"]
 
 
 def far_off(case: Recorded) -> Diagnosis | None:
@@ -45,9 +28,9 @@ def far_off(case: Recorded) -> Diagnosis | None:
         diagnosis = _does_not_fit(case, target) if target is not None else None
         if diagnosis is not None:
             return diagnosis
-    found = _against_tags(case)
+    found = against_tags(case)
     if found is None or not np.median(found.away_m) > _FAR_M:
-        return None
+        return _control_far_off(case)
     source, median = found.listed[0].source, float(np.median(found.away_m))
     why, cure = _what_would_fit(found)
     return Diagnosis(
@@ -67,7 +50,7 @@ def _does_not_fit(case: Recorded, target: str) -> Diagnosis | None:
     known = [photo.position for photo in case.done.photos if photo.position is not None]
     if not known:
         return None
-    lon, lat = np.array([_wgs84(position) for position in known]).T
+    lon, lat = np.array([wgs84(position) for position in known]).T
     try:
         crs = geo.parse_crs(target)
         geo.target_crs(target, lon, lat)
@@ -97,12 +80,54 @@ def _does_not_fit(case: Recorded, target: str) -> Diagnosis | None:
 
 def mixed_datum(case: Recorded) -> Diagnosis | None:
     """Heights, or positions, tens of metres off: an implicit datum, or two of them."""
-    found = _against_tags(case)
+    found = against_tags(case)
     if found is not None:
         diagnosis = _other_datum(case, found)
         if diagnosis is not None:
             return diagnosis
-    return _two_height_systems(case)
+    return _control_of_another_datum(case) or _two_height_systems(case)
+
+
+def _control_far_off(case: Recorded) -> Diagnosis | None:
+    """Control lies hundreds of metres from the positions, and the block on control."""
+    away_m = _gnss_minus_control_m(case)
+    across = float(np.hypot(*away_m[:2]))
+    if not across > _FAR_M:
+        return None
+    return Diagnosis(
+        name="far off",
+        cause=f"The measured positions lie {_length(across)} from where control puts them, all alike (east "
+        f"{away_m[0]:+.1f} m, north {away_m[1]:+.1f} m): control in another zone, or with swapped axes.",
+        cure="Compare the CRS in the first line of the list of control points with that of its coordinates; x (east) "
+        "comes first.",
+        figures={"gnss_minus_control_m": away_m.tolist()},
+    )
+
+
+def _control_of_another_datum(case: Recorded) -> Diagnosis | None:
+    """Control and positions are tens of metres apart, all alike: two datums."""
+    away_m = _gnss_minus_control_m(case)
+    across = float(np.hypot(*away_m[:2]))
+    if across > _FAR_M or not (across > _DATUM_M or abs(away_m[2]) > _DATUM_M):
+        return None
+    settings, frame = case.done.settings, case.done.control.reference.frame
+    above = "" if frame is None else f" Heights of the photos are {frame.height_datum}"
+    return Diagnosis(
+        name="mixed datum",
+        cause=f"All measured positions are off from control by the same (east {away_m[0]:+.1f} m, north "
+        f"{away_m[1]:+.1f} m, up {away_m[2]:+.1f} m): they are in two datums.{above} "
+        f"(crs.height_datum={settings['crs'].height_datum}), those of control are taken "
+        f"control.height_datum={settings['control'].height_datum}; a geoid lies up to 100 m off the ellipsoid.",
+        cure="Say what each is above: control.height_datum and crs.height_datum, ellipsoidal, mean_sea_level, or a "
+        "vertical CRS such as EPSG:5773. Control holds the block meanwhile.",
+        figures={"gnss_minus_control_m": away_m.tolist()},
+    )
+
+
+def _gnss_minus_control_m(case: Recorded) -> Float[np.ndarray, "3"]:
+    """Return what the positions are off from control in common, 0 where that is not known."""
+    adjusted = case.done.adjust
+    return np.zeros(3) if adjusted is None else np.nan_to_num(np.asarray(adjusted.gnss_minus_control_m, float))
 
 
 def _other_datum(case: Recorded, found: Against) -> Diagnosis | None:
@@ -205,8 +230,7 @@ def contradicting_gnss(case: Recorded) -> Diagnosis | None:
             f"{len(reference.review)} of {len(used)} positions are not used ({reference.review[0].name} "
             f"{reference.review[0].reason.rstrip('.')})"
         )
-    is_sound = done.adjust is not None and not has_large_errors(case) and not bounds_reached(case)
-    if is_sound and done.adjust.block.is_georeferenced:  # else the block itself may be what is bent
+    if _is_sound(case):
         texts += _against_photos(case, figures)
     if not texts:
         return None
@@ -217,6 +241,14 @@ def contradicting_gnss(case: Recorded) -> Diagnosis | None:
         "larger sigmas for the photos named.",
         figures=figures,
     )
+
+
+def _is_sound(case: Recorded) -> bool:
+    """Whether the block has a place on earth, and nothing says that it is itself what is bent."""
+    adjusted = case.done.adjust
+    if adjusted is None or not adjusted.block.is_georeferenced:
+        return False
+    return not has_large_errors(case) and not bounds_reached(case)
 
 
 def _against_photos(case: Recorded, figures: dict[str, object]) -> list[str]:
@@ -242,71 +274,23 @@ def _against_photos(case: Recorded, figures: dict[str, object]) -> list[str]:
     return texts
 
 
-def _wgs84(position: Position) -> tuple[float, float]:
-    """Return longitude and latitude; NaN where a position does not fit its CRS."""
-    try:
-        return Transformer.from_crs(position.crs, "EPSG:4326", always_xy=True).transform(position.x, position.y)
-    except ProjError:
-        return float("nan"), float("nan")
-
-
-def _against_tags(case: Recorded) -> Against | None:
-    """Return positions of a list beside those of the tags; None where there is no list, or the photos are gone."""
-    from jaxba.vision import read_photo
-
-    if case.done.metadata is None:
-        return None
-    pairs = []
-    for photo in case.done.photos[:_COMPARED]:
-        if photo.position is None or photo.position.source in ("EXIF", "XMP") or not photo.path.is_file():
-            continue
-        try:
-            tags = read_photo(PhotoFile(name=photo.name, path=photo.path, sha256=photo.sha256), max_focal_deviation=0.5)
-        except JaxbaError:  # its tags cannot be read any more: there is nothing to hold the list against
-            continue
-        if tags.position is not None and tags.position.source != photo.position.source:
-            pairs.append((photo, photo.position, tags.position))
-    if not pairs:
-        return None
-    photos, listed, tagged = zip(*pairs, strict=True)
-    first, second = (np.array([_wgs84(position) for position in entry]) for entry in (listed, tagged))
-    up = [np.nan if a.z_m is None or b.z_m is None else a.z_m - b.z_m for a, b in zip(listed, tagged, strict=True)]
-    return Against(
-        photos=photos, listed=listed, tagged=tagged, away_m=_apart_m(first, second), up_m=np.array(up, float)
-    )  # fmt: skip
-
-
-def _apart_m(first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Return how far places are apart; infinity where one of them is none on earth."""
-    valid = np.isfinite(first).all(axis=1) & (np.abs(first[:, 1]) <= 90)
-    away = np.full(len(first), np.inf)
-    if valid.any():
-        ends = first[valid, 0], first[valid, 1], second[valid, 0], second[valid, 1]
-        away[valid] = Geod(ellps="WGS84").inv(*ends)[2]
-    return away
-
-
 def _what_would_fit(found: Against) -> tuple[str, str]:
     """Return why positions are off, as far as swapped axes or another zone explain it, and the cure."""
-    second = np.array([_wgs84(position) for position in found.tagged])
+    second = np.array([wgs84(position) for position in found.tagged])
     crs = CRS(found.listed[0].crs)
-    swapped = np.array([_wgs84(_moved(position, position.y, position.x)) for position in found.listed])
-    if np.median(_apart_m(swapped, second)) < _AGREES_M:
+    swapped = np.array([wgs84(moved(position, position.y, position.x)) for position in found.listed])
+    if np.median(apart_m(swapped, second)) < _AGREES_M:
         return "its axes are swapped", "Write x (longitude, east) before y (latitude, north) in the list."
     if crs.utm_zone is not None:
         for zone in range(1, 61):
             code = f"EPSG:{(32600 if crs.utm_zone.endswith('N') else 32700) + zone}"
-            other = np.array([_wgs84(_moved(p, p.x, p.y, code)) for p in found.listed])
-            if np.median(_apart_m(other, second)) < _AGREES_M:
+            other = np.array([wgs84(moved(p, p.x, p.y, code)) for p in found.listed])
+            if np.median(apart_m(other, second)) < _AGREES_M:
                 return f"it is the wrong zone, {code} fits", f"Write {code} for {found.listed[0].crs} into the list."
     return (
         "neither swapped axes nor another UTM zone explains it",
         "Compare the list with the photos' tags, row by row.",
     )
-
-
-def _moved(position: Position, x: float, y: float, crs: str | None = None) -> Position:
-    return Position(crs=crs or position.crs, x=x, y=y)
 
 
 def _length(metres: float) -> str:

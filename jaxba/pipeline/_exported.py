@@ -1,5 +1,6 @@
 """The exports as they lie on the disk, read anew and held against the form that each file must have."""
 
+import csv
 import dataclasses
 import json
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from jaxba.scene import LocalFrame
 CLOUDS = ("cloud.csv", "cloud.ply", "cloud.laz")
 SITES = ("cameras.gpkg", "cameras.geojson")
 DESCRIPTION, FRAME, TEXT, BINARY = "cloud.csv.json", "colmap/frame.json", "colmap/text", "colmap/binary"
-OPENSFM, TILE = "reconstruction.json", "tile.npz"
+OPENSFM, TILE, CONTROL = "reconstruction.json", "tile.npz", "control.csv"
 _DESCRIBED = ("points", "EPSG", "code", "crs", "unit", "height_unit", "heights", "columns", "wkt")
 _CURE = "it was changed or damaged: run again to export it anew"
 
@@ -161,6 +162,36 @@ def _opensfm(path: Path) -> dict[str, Any]:
     return parts
 
 
+def _control(path: Path) -> list[dict[str, str]]:
+    """Return the rows of the surveyed points; a cell is a number, or empty where nothing is known."""
+    from jaxba.io._csv_control import CONTROL_COLUMNS
+
+    with open(path, encoding="utf-8", newline="") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    _expect_keys(path, dict.fromkeys(header), CONTROL_COLUMNS, "column")
+    table = []
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise JaxbaError(f"{path}, line {number}: {len(row)} values in {len(header)} columns; {_CURE}.")
+        cells = dict(zip(header, row, strict=True))
+        if cells["role"] not in ("control", "check"):
+            raise JaxbaError(f"{path}, line {number}: role is {cells['role']!r}, not control or check; {_CURE}.")
+        for name in header[2:-1]:
+            _number(path, number, name, cells[name])
+        table.append(cells)
+    return table
+
+
+def _number(path: Path, line: int, column: str, text: str) -> None:
+    must = column in ("marks", "surveyed_x", "surveyed_y")
+    try:
+        is_good = not (must and not text) and (not text or bool(np.isfinite(float(text))))
+    except ValueError:
+        is_good = False
+    if not is_good:
+        raise JaxbaError(f"{path}, line {line}: {column} is {text!r}, which is no finite number; {_CURE}.")
+
+
 def _cloud_figure(columns: str) -> Callable[[Any], str]:
     return lambda found: f"{columns}, {found.cloud.num_points:,} points"
 
@@ -184,6 +215,7 @@ _READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Any], str]]] = {
     BINARY: (_binary, lambda found: f"{found.num_images:,} images, {found.num_points:,} points"),
     FRAME: (_frame, lambda found: "no place on earth" if found is None else f"origin and {found.crs}"),
     OPENSFM: (_opensfm, lambda found: f"{len(found['shots']):,} shots, {len(found['points']):,} points"),
+    CONTROL: (_control, lambda found: f"18 columns, {len(found):,} control and check points"),
     TILE: (_tile, lambda found: f"{found.num_images:,} images, {found.num_points:,} points"),
 }
 """How each file, or folder of files, is read, and its figure."""

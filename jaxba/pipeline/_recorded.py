@@ -11,6 +11,8 @@ from jaxba.pipeline._stages import STAGES, Done
 from jaxba.pipeline._work import collected, works
 from jaxba.scene import Left
 
+_OF_FILES = ("metadata", "control")  # their inputs are photos and lists, which may have moved since
+
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
@@ -51,10 +53,10 @@ def recorded(folder: Path) -> Recorded:
     stopped = ended.get("stopped")
     last = stopped["stage"] if isinstance(stopped, dict) else stage_now
     for stage in STAGES:
-        if stage.name == "metadata":  # its inputs are the files, which may have moved since
-            if last == "metadata" or _store.read_record(project.stage(stage.name)) is None:
+        if stage.name in _OF_FILES:
+            if stage.name == last or _store.read_record(project.stage(stage.name)) is None:
                 break
-            done.metadata = _store.load(project.stage(stage.name), stage.module.Outputs)
+            setattr(done, stage.name, _store.load(project.stage(stage.name), stage.module.Outputs))
             continue
         items = [item for item in works(project, stage, done, settings[stage.name]) if item.record is not None]
         if not items:

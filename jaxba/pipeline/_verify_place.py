@@ -15,7 +15,7 @@ from jaxtyping import Float
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
-from jaxba.pipeline import crs as crs_stage, metadata
+from jaxba.pipeline import control, metadata
 from jaxba.pipeline._check import Check, failed, judged, skipped
 from jaxba.pipeline._exported import CLOUDS, DESCRIPTION, FRAME, TEXT, Exported
 from jaxba.pipeline._project import Project
@@ -42,13 +42,16 @@ class Measured:
     unit_m: float
 
 
-def place_checks(project: Project, exported: Exported) -> Iterator[Check]:
-    """Yield the checks of CRS and place; skipped where the block has none."""
-    missing = [name for name in ("crs", "metadata") if read_record(project.stage(name)) is None]
+def place_checks(project: Project, exported: Exported, offset_m: Float[np.ndarray, "3"]) -> Iterator[Check]:
+    """Yield the checks of CRS and place; skipped where the block has none.
+
+    `offset_m`: what control moved the measured positions by.
+    """
+    missing = [name for name in ("control", "metadata") if read_record(project.stage(name)) is None]
     if missing:
         yield failed("CRS", f"the record of the {missing[0]} stage is missing or damaged; run again to make it anew.")
         return
-    reference = load(project.stage("crs"), crs_stage.Outputs).reference
+    reference = load(project.stage("control"), control.Outputs).reference
     if (exported.has(FRAME) and exported.frame is None) or reference.frame is None:
         for name in ("CRS", "area of use", "cloud at its cameras", "positions in the cloud's box", "camera positions"):
             yield skipped(name, _NO_PLACE)
@@ -76,7 +79,7 @@ def place_checks(project: Project, exported: Exported) -> Iterator[Check]:
     for name in (name for name, xy in clouds.items() if len(xy)):
         yield _at_cameras(name, exported, measured)
         yield _around_positions(name, exported, measured)
-    yield _camera_positions(exported, measured)
+    yield _camera_positions(exported, measured, float(np.hypot(*offset_m[:2])))
 
 
 def _finite_xy(exported: Exported, file: str) -> Float[np.ndarray, "points 2"]:
@@ -197,7 +200,7 @@ def _around_positions(file: str, exported: Exported, measured: Measured) -> Chec
     )
 
 
-def _camera_positions(exported: Exported, measured: Measured) -> Check:
+def _camera_positions(exported: Exported, measured: Measured, moved_m: float) -> Check:
     """The adjusted cameras, of the GeoPackage, lie where they were measured."""
     name, file = "camera positions", "cameras.gpkg"
     if not exported.has(file):
@@ -209,12 +212,13 @@ def _camera_positions(exported: Exported, measured: Measured) -> Check:
     places = np.array([measured.xy[sites.name[k]] for k in rows])
     away_m = measured.unit_m * np.hypot(*(sites.xyz[rows, :2] - places).T)
     extent_m = measured.unit_m * float(np.hypot(*np.ptp(places, axis=0)))
-    median, limit = float(np.median(away_m)), max(_SIGMAS * measured.std_m, _BEND * extent_m)
+    median, limit = float(np.median(away_m)), max(_SIGMAS * measured.std_m, _BEND * extent_m) + moved_m
     figures = f"adjusted minus measured is {median:.2f} m horizontally (median of {len(rows)} photos)"
     return judged(
         name,
         median <= limit,
         f"{figures}, at most {limit:.2f} m",
-        f"{file}: {figures}, over {limit:.2f} m (five sigmas, or 5% of the positions' extent): its places are shifted; "
+        f"{file}: {figures}, over {limit:.2f} m (five sigmas, or 5% of the positions' extent, "
+        f"and what control moves them): its places are shifted; "
         f"if all files are, see `jaxba diagnose`, else {_CURE}.",
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from jaxba.pipeline import (
     _diagnose_adjustment as adjustment,
+    _diagnose_control as control,
     _diagnose_limits as limits,
     _diagnose_matching as matching,
     _diagnose_place as place,
@@ -32,6 +33,7 @@ RULES: tuple[Rule, ...] = (
     adjustment.large_median,
     adjustment.at_bound,
     adjustment.out_of_steps,
+    control.poor_control,
 )
 
 

@@ -55,10 +55,10 @@ def verify(folder: Path, params: Params) -> list[Check]:
         *schema,
         *_counts(exported),
         *_finite(exported),
-        _same_points(exported),
+        _same_points(exported, adjusted),
         _median(exported, params),
         _inliers(adjusted, params),
-        *place_checks(project, exported),
+        *place_checks(project, exported, np.zeros(3) if adjusted is None else adjusted.gnss_offset_m),
     ]
 
 
@@ -151,12 +151,17 @@ def _all_finite(file: str, values: dict[str, np.ndarray], names: Sequence[str]) 
     )
 
 
-def _same_points(exported: Exported) -> Check:
-    """Every cloud has the same points at the same coordinates, and COLMAP's points are those in the CRS."""
+def _same_points(exported: Exported, adjusted: adjust.Outputs | None) -> Check:
+    """Every cloud has the same points at the same coordinates, and COLMAP's points are those in the CRS.
+
+    Where control was fitted by twelve parameters, the clouds are mapped by them and COLMAP's poses cannot be.
+    """
     name, clouds = "same points", {file: exported[file].cloud for file in CLOUDS if exported.has(file)}
     places = {file: (cloud.point_id, cloud.xyz) for file, cloud in clouds.items()}
     if exported.has(TEXT) and places:
         xyz_m = exported[TEXT].block.points_m
+        if adjusted is not None:
+            xyz_m = xyz_m @ adjusted.affine[:, :3].T + adjusted.affine[:, 3]
         try:
             xyz = _in_crs(exported, xyz_m)
         except JaxbaError as error:

@@ -27,10 +27,10 @@ from jaxba.vision import PhotoTags, jpeg_with_tags
 FOCAL_PX = 540  # of the small survey
 
 
-def found(survey: Survey, *changes: str, until: str | None, geotags: Path | None = None) -> dict[str, Diagnosis]:
+def found(survey: Survey, *changes: str, until: str | None, **lists: Path) -> dict[str, Diagnosis]:
     """Run a survey as far as it goes, and return what is diagnosed."""
     with contextlib.suppress(JaxbaError):  # diagnosis is for runs that stop, too
-        survey.run(*changes, until=until, geotags=geotags)
+        survey.run(*changes, until=until, **lists)
     return {diagnosis.name: diagnosis for diagnosis in diagnose(survey.project)}
 
 
@@ -165,6 +165,21 @@ def test_two_height_systems_in_one_set(made: Survey, tmp_path: Path):
     result = found(made.copy(tmp_path), until="crs", geotags=geo_txt(tmp_path / "geo.txt", "EPSG:4326", rows))
     assert result["mixed datum"].figures["apart_m"] == pytest.approx(27.0, abs=1.0)  # the barometer's noise
     assert "two groups" in result["mixed datum"].cause
+
+
+def test_control_of_another_datum_with_a_blunder(made: Survey, tmp_path: Path):
+    """All heights of the list are 27 m up, and one of its points is 0.6 m east of where it was surveyed."""
+    crs, *marks = (made.photos.parent / "gcp_list.txt").read_text().splitlines()
+    rows = [mark.split() for mark in marks]
+    for row in rows:
+        row[0] = f"{float(row[0]) + 0.6 * (row[-1] == 'gcp02'):.4f}"
+        row[2] = f"{float(row[2]) + 27:.4f}"
+    (tmp_path / "gcp_list.txt").write_text("\n".join([crs, *(" ".join(row) for row in rows), ""]))
+    result = found(made.copy(tmp_path), until="adjust", gcp=tmp_path / "gcp_list.txt")
+    assert set(result) == {"mixed datum", "poor control"}
+    assert result["mixed datum"].figures["gnss_minus_control_m"][2] == pytest.approx(-27, abs=0.5)
+    assert "control.height_datum" in result["mixed datum"].cure
+    assert "gcp02" in result["poor control"].figures["suspects"] and "not the solver" in result["poor control"].cause
 
 
 def test_altitudes_that_climb_in_one_flight(tmp_path: Path):

@@ -1,10 +1,10 @@
 """Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
 
 from jaxba.pipeline._diagnosis import Diagnosis, some
-from jaxba.pipeline._limits import store_bytes
+from jaxba.pipeline._limits import num_keypoints, store_bytes
 from jaxba.pipeline._recorded import Recorded
-from jaxba.pipeline._tuning import tune
 from jaxba.pipeline._workers import Resources, bytes_of, machine_memory, memory_for
+from jaxba.pipeline.features import Params
 
 _BY_PHOTOS = ("features", "match")
 
@@ -66,8 +66,9 @@ def over_store(case: Recorded) -> Diagnosis | None:
     if case.stopped is None or case.stopped.name != "features" or case.done.pairs is None:
         return None
     resources: Resources = case.done.settings["workers"]
-    detector, asked = case.done.routing.detector, case.done.settings["features"].nfeatures
-    need = store_bytes(len(case.done.photos), detector, tune(detector, (), None, nfeatures=asked).nfeatures)
+    params: Params = case.done.settings["features"]
+    detector = case.done.routing.detector
+    need = store_bytes(len(case.done.photos), detector, num_keypoints(detector, params))
     allowed = bytes_of(resources.max_store, float("nan"))  # a share of a disk whose room has changed since says nothing
     if not need > allowed:
         return None

@@ -17,6 +17,11 @@ _PHOTO_BYTES = 6000  # record and headers
 _SHOWN = 3
 
 
+def num_keypoints(detector: str, params: Params) -> int:
+    """Return the most keypoints that a photo has: as set, or the detector's own number."""
+    return tune(detector, (), None, nfeatures=params.nfeatures).nfeatures
+
+
 def store_bytes(num_photos: int, detector: str, nfeatures: int) -> float:
     """Return the bytes that the features of so many photos take on the disk at most."""
     if detector in _DESCRIPTOR_BYTES:
@@ -32,7 +37,7 @@ def check_store(store: Path, num_photos: int, detector: str, params: Params, res
     - `store`: the folder where they are to lie; what lies there already is theirs, or is replaced: it counts as free.
     - `detector`: of all photos.
     """
-    nfeatures = tune(detector, (), None, nfeatures=params.nfeatures).nfeatures
+    nfeatures = num_keypoints(detector, params)
     need = store_bytes(num_photos, detector, nfeatures)
     place = next(folder for folder in (store, *store.absolute().parents) if folder.exists())
     free = float(shutil.disk_usage(place).free)

@@ -201,7 +201,8 @@ def gnss_offset(
     The median of block minus measured position. What all positions have in common (another datum, the antenna's offset)
     contradicts control by itself, and control is right; their scatter is what they tell. Positions of a single receiver
     (a sigma over `PLAIN_M`) always have such an offset. Better ones hold the height and with it the focal length, so
-    they are moved only where they contradict a block that was solved with them, by three sigmas: `is_later`.
+    they are moved only where they contradict a block that was solved with them, by three sigmas: `is_later`. Over flat
+    ground, seen straight down, an offset of their heights looks like another focal length and does not show.
     """
     index = block.image_index[reference.is_used[block.image_index]]
     if control is None or not len(index):

@@ -245,3 +245,17 @@ def test_affine_shears_only_what_points_tell() -> None:
     held = fit_affine(flat, apply_affine(true, flat), np.full((12, 3), 0.01))
     np.testing.assert_allclose(held[:, 2], [0, 0, 1], atol=1e-9)
     np.testing.assert_allclose(held[:, [0, 1, 3]], true[:, [0, 1, 3]], atol=2e-5)
+
+
+def test_good_positions_are_moved_only_where_they_contradict_control(survey: Simulated, points: Control) -> None:
+    centers = np.asarray(survey.survey.truth.poses.center)
+    std_m = np.tile([0.03, 0.03, 0.05], (12, 1))
+    measured = centers + std_m * np.random.default_rng(3).normal(size=centers.shape)
+    # horizontal: an offset of heights over flat ground looks like another focal length
+    offset_m = np.array([0.5, 0.0, 0.0])
+    for off_m in (np.zeros(3), offset_m):
+        reference = replace(survey.reference, xyz_m=measured + off_m, std_m=std_m)
+        adjusted, found = run(replace(survey, reference=reference), points)
+        np.testing.assert_allclose(found.fit.gnss_minus_control_m, off_m, atol=0.15)
+        assert ((adjusted.gnss_offset_m != 0) == (off_m != 0)).all()
+        assert (found.fit.check_rms_m < [0.04, 0.04, 0.08]).all()

@@ -49,8 +49,8 @@ def poor_control(case: Recorded) -> Diagnosis | None:
         name="poor control",
         cause=f"The photos fit (median {done.adjust.median_px:.2f} px), and the surveyed points do not: "
         f"{'. '.join(text[0].upper() + text[1:] for text in texts if text)}; {weak}. It is control, not the solver.",
-        cure="Look at marks and coordinates of the points named, make a doubtful one a check point (control.check), check "
-        "the CRS and the heights of the list, and survey points at the block's corners and middle.",
+        cure="Look at marks and coordinates of the points named, make a doubtful one a check point (control.check), "
+        "check the CRS and the heights of the list, and survey points at the block's corners and middle.",
         figures={
             "control_rms_m": list(map(float, fit.control_rms_m)),
             "check_rms_m": list(map(float, fit.check_rms_m)),

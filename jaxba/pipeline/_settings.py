@@ -100,7 +100,7 @@ def _explained(field: Field) -> str:
 
 def _toml_value(value: Any) -> str:
     if value is None or isinstance(value, str):
-        return '"' + (value or "none").replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return '"' + ("none" if value is None else value).replace("\\", "\\\\").replace('"', '\\"') + '"'
     return plain(value) if isinstance(value, bool) else repr(value)
 
 

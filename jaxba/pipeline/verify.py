@@ -160,7 +160,7 @@ def _same_points(exported: Exported, adjusted: adjust.Outputs | None) -> Check:
     places = {file: (cloud.point_id, cloud.xyz) for file, cloud in clouds.items()}
     if exported.has(TEXT) and places:
         xyz_m = exported[TEXT].block.points_m
-        if adjusted is not None:
+        if adjusted is not None and not np.array_equal(adjusted.affine, np.eye(3, 4)):
             xyz_m = xyz_m @ adjusted.affine[:, :3].T + adjusted.affine[:, 3]
         try:
             xyz = _in_crs(exported, xyz_m)

@@ -38,7 +38,6 @@ def run_pipeline(
     geotags: Path | None = None,
     gcp: Path | None = None,
     check: Path | None = None,
-    resources: Resources | None = None,
     tell: Callable[[Event], None] = lambda event: None,
 ) -> Run:
     """Run the pipeline on a folder of photos, up to and with the stage `until`; what is unchanged is not run again.
@@ -57,11 +56,7 @@ def run_pipeline(
         given = Given(photos=photos, geotags=geotags, gcp=gcp, check=check)
         done = Done(files=project.photo_files(photos), settings=settings, **read_lists(given))
         project.write_text(SETTINGS, to_toml(settings))
-        if resources is None:
-            found = settings["workers"]
-            assert isinstance(found, Resources)
-            resources = found
-        return _run_stages(project, given, done, settings, until, resources, tell)
+        return _run_stages(project, given, done, settings, until, tell)
 
 
 def _run_stages(
@@ -70,9 +65,10 @@ def _run_stages(
     done: Done,
     settings: Settings,
     until: str | None,
-    resources: Resources,
     tell: Callable[[Event], None],
 ) -> Run:
+    resources = settings["workers"]
+    assert isinstance(resources, Resources)
     stages_run: list[str] = []
     lines: dict[str, list[str]] = {}
     for stage in STAGES:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxba.pipeline import Event, Resources, Run, changed, default_settings, run_pipeline
+from jaxba.pipeline import Event, Run, changed, default_settings, run_pipeline
 from jaxba.pipeline.simulate import Params, write_survey
 
 FAST = ("features.nfeatures=2000",)
@@ -44,18 +44,9 @@ class Survey:
         workers: int = 2,
         tell: Callable[[Event], None] = lambda event: None,
     ) -> Run:
-        settings = changed(default_settings(), [*FAST, *changes])
-        resources = Resources(workers=workers)
+        settings = changed(default_settings(), [*FAST, f"workers.workers={workers}", *changes])
         return run_pipeline(
-            self.photos,
-            self.project,
-            settings,
-            until=until,
-            geotags=geotags,
-            gcp=gcp,
-            check=check,
-            resources=resources,
-            tell=tell,
+            self.photos, self.project, settings, until=until, geotags=geotags, gcp=gcp, check=check, tell=tell
         )
 
 

@@ -119,10 +119,9 @@ def test_ctrl_c_ends_with_130_and_the_next_run_goes_on(cli: Cli, photos: Path, t
     os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it, to the workers too
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert err.splitlines() == [
-        "metadata  begins", "crs       begins", f"features  begins, {NUM_PHOTOS} photos",
-        "jaxba: interrupted; what is done is kept, and the same command goes on from there.",
-    ]  # fmt: skip
+    *begun, last = err.splitlines()
+    assert begun[0] == "metadata  begins" and f"features  begins, {NUM_PHOTOS} photos" in begun
+    assert last == "jaxba: interrupted; what is done is kept, and the same command goes on from there."
     kept = {path: path.stat().st_ino for path in features.glob("*/record.json")}
     assert 1 <= len(kept) < NUM_PHOTOS and not list(features.glob(".*"))
     code, out, _ = cli(*arguments)

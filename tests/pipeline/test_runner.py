@@ -172,7 +172,7 @@ def test_a_run_stops_after_the_stage_that_it_is_told_and_the_project_keeps_the_r
     run = survey.run(until="pairs")
     assert run.stages_run == () and run.done.pairs is not None and run.done.match is None
     assert survey.run().stages_run == ()
-    with pytest.raises(JaxbaError, match="stage 'paris': choose one of metadata, crs, pairs, features"):
+    with pytest.raises(JaxbaError, match="stage 'paris': choose one of metadata, crs, control, pairs, features"):
         survey.run(until="paris")
 
 

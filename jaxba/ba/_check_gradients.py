@@ -175,8 +175,8 @@ def _rows(problem: Problem, loss: AbstractLoss, plan: Plan, rng: np.random.Gener
         difference, cost_difference = _best(differences)
         size = max(float(np.linalg.norm(difference)), _TINY)
         error = float(np.linalg.norm(weights * found - difference)) / size
-        # the cost itself is exact to 1e-16 of its size, its difference to 1e-12: below that there is nothing to compare
-        cost_size = max(abs(cost_difference), 1e-6 * float(plus.final_cost))
+        # over the short steps the cost's difference is exact to some 1e-11 of the cost: less has nothing to compare with
+        cost_size = max(abs(cost_difference), 1e-5 * float(plus.final_cost))
         reverse_error = abs(float(cotangent @ found) - float(np.vdot(gradient[name], along)))
         yield GradientRow(
             name=name,

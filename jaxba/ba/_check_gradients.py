@@ -175,7 +175,7 @@ def _rows(problem: Problem, loss: AbstractLoss, plan: Plan, rng: np.random.Gener
         difference, cost_difference = _best(differences)
         size = max(float(np.linalg.norm(difference)), _TINY)
         error = float(np.linalg.norm(weights * found - difference)) / size
-        # over the short steps the cost's difference is exact to some 1e-11 of the cost: less has nothing to compare with
+        # over short steps the cost's difference is exact to some 1e-11 of the cost: there is nothing smaller to compare
         cost_size = max(abs(cost_difference), 1e-5 * float(plus.final_cost))
         reverse_error = abs(float(cotangent @ found) - float(np.vdot(gradient[name], along)))
         yield GradientRow(

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxba.pipeline._words import many
+
 _SHOWN = 10
 
 
@@ -14,16 +16,12 @@ def control_lines(outputs: Any) -> tuple[str, list[str]]:
         return "no list of control points", []
     checks = int(control.is_check.sum())
     count = control.num_points - checks
-    first = f"{_many(count, 'control point')}, {_many(checks, 'check point')}; {_many(len(control.mark_point), 'mark')}"
+    first = f"{many(count, 'control point')}, {many(checks, 'check point')}; {many(len(control.mark_point), 'mark')}"
     images = len(np.unique(control.mark_image))
     left = [f"Left out: {entry.name}: {entry.reason}." for entry in outputs.left_out]
     if len(left) > _SHOWN:
         left = [*left[:_SHOWN], f"and {len(left) - _SHOWN} more such, each with its reason in summary.json."]
-    return f"{first} in {_many(images, 'photo')}", [*outputs.notes, *left]
-
-
-def _many(count: int, noun: str) -> str:
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+    return f"{first} in {many(images, 'photo')}", [*outputs.notes, *left]
 
 
 def control_facts(done: Any) -> dict[str, Any]:
@@ -53,7 +51,7 @@ def control_rows(facts: dict[str, Any] | None) -> list[tuple[str, str]]:
         axes = zip(("east", "north", "up"), group["rms_m"], strict=True)
         used = {axis: value for axis, value in axes if value is not None}
         figures = ", ".join(f"{value:.3f}" for value in used.values())
-        text = f"RMS {figures} m {', '.join(used)} over {_many(group['num'], 'point')}"
+        text = f"RMS {figures} m {', '.join(used)} over {many(group['num'], 'point')}"
         rows.append((role, f"{text}; worst {group['worst']} by {group['worst_m']:.3f} m"))
     return rows
 

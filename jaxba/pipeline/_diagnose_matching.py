@@ -1,10 +1,12 @@
 """Rules on features, pairs and groups: too few matches, photos that fall apart, photos from one place."""
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
-from jaxba.pipeline._diagnosis import Diagnosis, some
+from jaxba.pipeline._diagnosis import Diagnosis
 from jaxba.pipeline._recorded import Recorded
+from jaxba.pipeline._words import some
+from jaxba.pipeline.tracks import pairs_between
 from jaxba.scene import components
 
 _OVERLAPS = 0.3  # pairs that overlap by more should match
@@ -34,8 +36,7 @@ def few_matches(case: Recorded) -> Diagnosis | None:
     graph, overlap = done.match.view_graph, done.pairs.overlap
     rows = _rows_of(graph.pairs, done.pairs.pairs)
     overlap = np.where(rows >= 0, overlap[rows], np.nan)
-    largest = _largest(graph.pairs, overlap, len(done.photos))
-    typical = float(np.median(largest[np.isfinite(largest)])) if np.isfinite(largest).any() else np.nan
+    typical = done.routing.overlap
     if np.isfinite(overlap).any():
         expected = overlap >= min(_OVERLAPS, typical)
         what = f"candidate pairs that should overlap by {min(_OVERLAPS, typical):.0%} or more"
@@ -98,12 +99,7 @@ def several_groups(case: Recorded) -> Diagnosis | None:
     ]
     if len(groups) < 2:
         return None
-    label = np.full(len(names), -1)
-    for number, group in enumerate(groups):
-        label[list(group)] = number
-    ends = label[graph.pairs]
-    between = np.flatnonzero((ends[:, 0] != ends[:, 1]) & (ends >= 0).all(axis=1))
-    between = between[np.argsort(-graph.num_putative[between], kind="stable")]
+    between = pairs_between(groups, graph)
     shown = "; ".join(f"{len(group)} photos ({some([names[i] for i in group], 3)})" for group in groups[:_NEAREST])
     more = f"; and {len(groups) - _NEAREST} more" if len(groups) > _NEAREST else ""
     cause = f"The photos fall into {len(groups)} groups that no verified pair joins: {shown}{more}."
@@ -187,12 +183,3 @@ def _rows_of(pairs: Int[np.ndarray, "pairs 2"], candidates: Int[np.ndarray, "can
     """Return the candidate's row of each pair."""
     row = {tuple(pair): k for k, pair in enumerate(candidates.tolist())}
     return np.array([row.get(tuple(pair), -1) for pair in pairs.tolist()], dtype=np.int64)
-
-
-def _largest(pairs: Int[np.ndarray, "pairs 2"], overlap: np.ndarray, count: int) -> np.ndarray:
-    """Return each photo's largest known overlap; NaN where none is known."""
-    largest = np.full(count, -np.inf)
-    known: Bool[np.ndarray, " pairs"] = np.isfinite(overlap)
-    for side in (0, 1):
-        np.maximum.at(largest, pairs[known, side], overlap[known])
-    return np.where(np.isfinite(largest), largest, np.nan)

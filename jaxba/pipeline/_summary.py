@@ -13,9 +13,10 @@ from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._pair_record import pair_facts, pair_lines
 from jaxba.pipeline._stages import Done
+from jaxba.pipeline._words import many, some_photos
 from jaxba.scene import EdgeStatus, Left, ViewGraph
 
-_SHOWN, _MOST_LINES = 3, 10
+_MOST_LINES = 10
 _NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)")
 
 
@@ -25,8 +26,8 @@ def stage_lines(event: Event) -> list[str]:
     notes: list[str] = []
     if event.stage == "metadata":
         cameras = len({photo.camera for photo in outputs.photos})
-        left = f", {_many(len(event.left_out), 'file')} left out" if event.left_out else ""
-        first = f"{_many(len(outputs.photos), 'photo')}, {_many(cameras, 'camera')}{left}"
+        left = f", {many(len(event.left_out), 'file')} left out" if event.left_out else ""
+        first = f"{many(len(outputs.photos), 'photo')}, {many(cameras, 'camera')}{left}"
         notes = [*outputs.notes, *_grouped(event.left_out)]
     elif event.stage == "crs":
         reference = outputs.reference
@@ -57,18 +58,18 @@ def stage_lines(event: Event) -> list[str]:
         notes = [*pair_lines(graph, outputs.record), *_grouped(event.left_out)]
     elif event.stage == "tracks":
         tracks = outputs.tracks
-        largest = f"{len(tracks.components[0])} of {_many(len(event.photos), 'photo')} in the largest group"
+        largest = f"{len(tracks.components[0])} of {many(len(event.photos), 'photo')} in the largest group"
         first = f"{tracks.num_tracks:,} tracks, {tracks.num_observations:,} observations; {largest}"
         notes = list(outputs.notes)
     elif event.stage == "start":
         block = outputs.block
-        first = f"{_many(block.num_images, 'image')}, {block.num_points:,} points"
+        first = f"{many(block.num_images, 'image')}, {block.num_points:,} points"
         notes = [*block.notes, *_grouped(event.left_out)]
     elif event.stage == "adjust":
-        first = f"median {outputs.median_px:.2f} px, {_many(outputs.rounds, 'round')}"
+        first = f"median {outputs.median_px:.2f} px, {many(outputs.rounds, 'round')}"
         notes = _grouped(event.left_out)
     else:
-        first = _many(len(outputs.files), "file")
+        first = many(len(outputs.files), "file")
         notes = list(outputs.notes)
     return [first, *event.notes, *notes]
 
@@ -168,7 +169,7 @@ def _grouped(entries: Sequence[Left]) -> list[str]:
     names: dict[str, list[str]] = {}
     for entry in entries:
         names.setdefault(entry.reason, []).append(entry.name)
-    lines = [f"{_some(found)}: {reason}" for reason, found in names.items()]
+    lines = [f"{some_photos(found)}: {reason}" for reason, found in names.items()]
     if len(lines) <= _MOST_LINES:
         return lines
     rest = sum(len(found) for found in list(names.values())[_MOST_LINES:])
@@ -188,15 +189,6 @@ def _with_ranges(entries: Sequence[Left]) -> list[Left]:
         reason = re.sub("#", lambda _, texts=texts: next(texts), kind)
         result += [Left(name=entry.name, reason=reason) for entry in alike]
     return result
-
-
-def _some(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:_SHOWN])
-    return shown if len(names) <= _SHOWN else f"{len(names)} photos ({shown}, ...)"
-
-
-def _many(count: int, noun: str) -> str:
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def _finite(value: Any) -> Any:

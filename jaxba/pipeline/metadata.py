@@ -13,6 +13,7 @@ from pathlib import PurePosixPath
 from jaxba._errors import JaxbaError
 from jaxba.io import Geotag, match_geotags, parse_geotags
 from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.pipeline._words import some_photos
 from jaxba.scene import Attitude, Left, Photo, PhotoFile
 from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
 
@@ -127,7 +128,7 @@ def _photo_notes(photos: list[Photo]) -> list[str]:
     for photo in photos:
         for note in photo.notes:
             names.setdefault(note, []).append(photo.name)
-    notes = [f"{_some(found)}: {note}" for note, found in sorted(names.items(), key=lambda item: -len(item[1]))]
+    notes = [f"{some_photos(found)}: {note}" for note, found in sorted(names.items(), key=lambda item: -len(item[1]))]
     if len(notes) > _MOST_NOTES:
         more = len(notes) - _MOST_NOTES
         return [
@@ -135,13 +136,6 @@ def _photo_notes(photos: list[Photo]) -> list[str]:
             f"{more} more findings, each of as many photos or fewer, stand in the photos' notes.",
         ]
     return notes
-
-
-def _some(names: list[str]) -> str:
-    shown = ", ".join(names[:_SHOWN])
-    if len(names) <= _SHOWN:
-        return shown
-    return f"{len(names)} photos ({shown}, ...)"
 
 
 def _tagged(photo: Photo, entry: Geotag | None, is_nadir_zero: bool) -> Photo:

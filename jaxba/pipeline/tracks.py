@@ -4,9 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.pipeline._words import some
 from jaxba.scene import Features, Photo, Tracks, ViewGraph, build_tracks
 
 _NAMED = 5  # images and pairs of each group that a message names
@@ -61,6 +63,14 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     return Outputs(tracks=tracks, notes=tuple(notes))
 
 
+def pairs_between(groups: Sequence[tuple[int, ...]], graph: ViewGraph) -> Int[np.ndarray, " pairs"]:
+    """Return the rows of the candidate pairs that would join groups of images, those with the most matches first."""
+    label = {image: number for number, group in enumerate(groups) for image in group}
+    ends = np.array([(label.get(i, -1), label.get(j, -1)) for i, j in graph.pairs.tolist()], int).reshape(-1, 2)
+    between = np.flatnonzero((ends[:, 0] != ends[:, 1]) & (ends >= 0).all(axis=1))
+    return between[np.argsort(-graph.num_putative[between], kind="stable")]
+
+
 def _has_keypoints(inputs: Inputs, image: int) -> bool:
     return image in inputs.features and inputs.features[image].num_keypoints > 0
 
@@ -87,16 +97,11 @@ def _nothing_joined(inputs: Inputs) -> str:
 def _describe(groups: Sequence[tuple[int, ...]], inputs: Inputs) -> str:
     """Return which photos fall apart and which pairs would join them."""
     graph, photos = inputs.view_graph, inputs.photos
-    shown = [f"{len(group)} photos ({_names([photos[i].name for i in group])})" for group in groups[:_NAMED]]
+    shown = [f"{len(group)} photos ({some([photos[i].name for i in group])})" for group in groups[:_NAMED]]
     if len(groups) > _NAMED:
         rest = [photos[group[0]].name for group in groups[_NAMED:]]
-        shown.append(f"{len(rest)} smaller groups, that of {_names(rest)}")
-    label = np.full(len(photos), -1)
-    for number, group in enumerate(groups):
-        label[list(group)] = number
-    ends = label[graph.pairs]
-    between = np.flatnonzero((ends[:, 0] != ends[:, 1]) & (ends >= 0).all(axis=1))
-    between = between[np.argsort(-graph.num_putative[between], kind="stable")]
+        shown.append(f"{len(rest)} smaller groups, that of {some(rest)}")
+    between = pairs_between(groups, graph)
     text = f"The photos fall into {len(groups)} groups without common tracks: {'; '.join(shown)}."
     if len(between) == 0:
         return text + " No candidate pair joins them: set pairs.method=exhaustive, or fly photos between them."
@@ -107,7 +112,3 @@ def _describe(groups: Sequence[tuple[int, ...]], inputs: Inputs) -> str:
         f"before verification): {'; '.join(joining)}{' and others' if len(between) > _NAMED else ''}. Lower "
         "features.contrast_threshold, raise features.nfeatures, or fly more overlap between them."
     )
-
-
-def _names(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jaxba.cli._text import many, to_json, wrapped
 from jaxba.pipeline import changed, from_toml, project_settings
-from jaxba.pipeline.verify import Params, verify
+from jaxba.pipeline.verification import Params, verify
 
 _LABEL = 9
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline import verify
+from jaxba.pipeline import verification
 from jaxba.pipeline._key import plain
 from jaxba.pipeline._parameters import Parameters, allowed, taken
 from jaxba.pipeline._stages import STAGES
@@ -31,7 +31,7 @@ Settings = Mapping[str, Parameters]
 def default_settings() -> dict[str, Parameters]:
     """Return every section's defaults: those of the stages, in their order, of tiles, workers and checks."""
     stages = {stage.name: stage.module.Params() for stage in STAGES}
-    return {**stages, "tiles": Tiles(), "workers": Resources(), "verify": verify.Params()}
+    return {**stages, "tiles": Tiles(), "workers": Resources(), "verify": verification.Params()}
 
 
 def changed(settings: Settings, changes: Sequence[str]) -> dict[str, Parameters]:

@@ -17,10 +17,10 @@ from small_survey import NUM_PHOTOS, Survey, repaint
 from jaxba import JaxbaError
 from jaxba.cli import main
 from jaxba.pipeline import changed, default_settings, run_pipeline
-from jaxba.pipeline._diagnose_adjustment import out_of_steps
-from jaxba.pipeline._diagnosis import Diagnosis
 from jaxba.pipeline._recorded import recorded
-from jaxba.pipeline.diagnose import RULES, diagnose
+from jaxba.pipeline.diagnosis import RULES, diagnose
+from jaxba.pipeline.diagnosis._adjustment import out_of_steps
+from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
 from jaxba.scene import Attitude
 from jaxba.vision import PhotoTags, jpeg_with_tags
 

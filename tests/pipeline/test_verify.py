@@ -15,7 +15,7 @@ from jaxba import JaxbaError
 from jaxba.cli import main
 from jaxba.io import CrsText
 from jaxba.io._read_cloud import read_csv_cloud, read_las, read_ply
-from jaxba.pipeline.verify import Params, verify
+from jaxba.pipeline.verification import Params, verify
 
 
 @pytest.fixture
@@ -128,7 +128,7 @@ def test_another_crs(export: Path):
 def test_a_compound_crs_survives_the_words_of_las():
     from pyproj import CRS
 
-    from jaxba.pipeline._verify_place import _same_crs
+    from jaxba.pipeline.verification._place import _same_crs
 
     text = "EPSG:32615+5773"
     wkt = CrsText(text=text, name="", unit="", height_unit="", height_note="").wkt1()

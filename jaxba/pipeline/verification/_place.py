@@ -16,10 +16,10 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from jaxba.pipeline import control, metadata
-from jaxba.pipeline._check import Check, failed, judged, skipped
-from jaxba.pipeline._exported import CLOUDS, DESCRIPTION, FRAME, TEXT, Exported
 from jaxba.pipeline._project import Project
 from jaxba.pipeline._store import load, read_record
+from jaxba.pipeline.verification._check import Check, failed, judged, skipped
+from jaxba.pipeline.verification._exported import CLOUDS, DESCRIPTION, FRAME, TEXT, Exported
 
 _EDGE_DEG = 0.05  # bounds of an area of use are rounded
 _REACH = 2.0  # of the distance from the cameras to their points

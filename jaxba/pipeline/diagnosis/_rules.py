@@ -7,15 +7,15 @@ was killed, is diagnosed from the stages that ended. Causes come before what fol
 from collections.abc import Callable
 from pathlib import Path
 
-from jaxba.pipeline import (
-    _diagnose_adjustment as adjustment,
-    _diagnose_control as control,
-    _diagnose_limits as limits,
-    _diagnose_matching as matching,
-    _diagnose_place as place,
-)
-from jaxba.pipeline._diagnosis import Diagnosis
 from jaxba.pipeline._recorded import Recorded, recorded
+from jaxba.pipeline.diagnosis import (
+    _adjustment as adjustment,
+    _control as control,
+    _limits as limits,
+    _matching as matching,
+    _place as place,
+)
+from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
 
 Rule = Callable[[Recorded], Diagnosis | None]
 

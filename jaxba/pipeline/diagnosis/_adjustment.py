@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._diagnosis import Diagnosis
 from jaxba.pipeline._recorded import Recorded
 from jaxba.pipeline._words import some
+from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
 from jaxba.scene import Photo, PhotoFile
 
 _HIGH_COST_PX = 1.5

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from jaxba.pipeline._diagnose_adjustment import has_large_errors
-from jaxba.pipeline._diagnosis import Diagnosis
 from jaxba.pipeline._recorded import Recorded
 from jaxba.pipeline._words import some
+from jaxba.pipeline.diagnosis._adjustment import has_large_errors
+from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
 
 _OVER_SIGMA = 3.0  # RMS of the points over their predicted sigma
 _LEAST_M = 0.02  # what a target is surveyed to

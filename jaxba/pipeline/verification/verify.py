@@ -2,7 +2,7 @@
 
 Files and their form, counts that agree, numbers that are finite, the same points in every cloud, the reprojection
 errors computed anew from COLMAP's text, the inlier rate that the adjustment recorded; then the CRS and the place on
-earth (see `_verify_place.py`).
+earth (see `_place.py`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,11 +13,21 @@ import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline import adjust, export
-from jaxba.pipeline._check import Check, failed, judged, ok, skipped
-from jaxba.pipeline._exported import BINARY, CLOUDS, DESCRIPTION, OPENSFM, SITES, TEXT, TILE, Exported, read_export
 from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.pipeline._project import Project
 from jaxba.pipeline._store import damaged_file, load, read_record
+from jaxba.pipeline.verification._check import Check, failed, judged, ok, skipped
+from jaxba.pipeline.verification._exported import (
+    BINARY,
+    CLOUDS,
+    DESCRIPTION,
+    OPENSFM,
+    SITES,
+    TEXT,
+    TILE,
+    Exported,
+    read_export,
+)
 
 _ROUNDING = 0.002  # units of the CRS: CSV has three decimals, LAZ whole thousandths
 _CURE = "run again to export it anew"
@@ -39,7 +49,7 @@ def verify(folder: Path, params: Params) -> list[Check]:
 
     Raises `JaxbaError` where the folder is no project, or nothing was exported yet.
     """
-    from jaxba.pipeline._verify_place import place_checks  # loads pyproj
+    from jaxba.pipeline.verification._place import place_checks  # loads pyproj
 
     project = Project(folder, make=False)
     record = project.stage("export")

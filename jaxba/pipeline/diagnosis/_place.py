@@ -6,11 +6,11 @@ from jaxtyping import Bool, Float
 from pyproj import CRS
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._diagnose_adjustment import bounds_reached, has_large_errors
-from jaxba.pipeline._diagnosis import Diagnosis
-from jaxba.pipeline._listed import Against, against_tags, apart_m, moved, wgs84
 from jaxba.pipeline._recorded import Recorded
 from jaxba.pipeline._words import some
+from jaxba.pipeline.diagnosis._adjustment import bounds_reached, has_large_errors
+from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
+from jaxba.pipeline.diagnosis._listed import Against, against_tags, apart_m, moved, wgs84
 from jaxba.scene import Position
 
 _FAR_M = 100.0

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._check import Check, failed, ok
+from jaxba.pipeline.verification._check import Check, failed, ok
 from jaxba.scene import LocalFrame
 
 CLOUDS = ("cloud.csv", "cloud.ply", "cloud.laz")

@@ -1,10 +1,10 @@
 """Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
 
-from jaxba.pipeline._diagnosis import Diagnosis
 from jaxba.pipeline._limits import num_keypoints, store_bytes
 from jaxba.pipeline._recorded import Recorded
 from jaxba.pipeline._words import some
 from jaxba.pipeline._workers import Resources, bytes_of, machine_memory, memory_for
+from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
 from jaxba.pipeline.features import Params
 
 _BY_PHOTOS = ("features", "match")

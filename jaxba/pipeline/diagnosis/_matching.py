@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.pipeline._diagnosis import Diagnosis
 from jaxba.pipeline._recorded import Recorded
 from jaxba.pipeline._words import some
+from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
 from jaxba.pipeline.tracks import pairs_between
 from jaxba.scene import components
 

@@ -1,6 +1,6 @@
 """The adjustment in rounds: solve, judge every observation anew, prune edges, triangulate anew, solve again.
 
-How observations are judged stands in `_judge.py`, how edges are in `_edges.py`.
+A round is in `_rounds.py`; how observations are judged stands in `_judge.py`, how edges are in `_edges.py`.
 
 Tracks are completed before the first round (see `_complete.py`), so that all rounds have one shape: a radius of 2 to
 6 px finds as much at the start values as at adjusted ones (points seen three times or more: +17% and +37% in two
@@ -19,36 +19,26 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import Problem, Solution, make_plan, reprojection_errors, solve
-from jaxba.ba._plan import Shape
-from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
+from jaxba.ba import Problem, Solution
+from jaxba.geometry import AbstractLoss
 from jaxba.scene import Block, Control, Features, Left, Photo, Reference, Tracks, ViewGraph
 from jaxba.sfm._complete import complete_tracks
 from jaxba.sfm._control import (
-    LEAST_TO_PLACE,
-    PLAIN_M,
     ControlPart,
     agreeing_marks,
-    control_part,
-    control_scale,
-    gnss_offset,
-    with_offset,
 )
-from jaxba.sfm._edges import edge_medians_px, match_rows, without_edges
+from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, without_edges
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
-from jaxba.sfm._points import apply_points, track_rows, triangulate_tracks
-from jaxba.sfm._problem import free_parameters, to_problem, used_positions, with_solution
+from jaxba.sfm._points import apply_points, triangulate_tracks
+from jaxba.sfm._problem import free_parameters
+from jaxba.sfm._rounds import Rounds, without_images
 from jaxba.sfm._settings import Settings
 
 _log = logging.getLogger(__name__)
 
-_SPARE = 0.03  # room for tracks that pruning cuts in two
 _START_ERROR = 0.005  # of the longer side: what start values are good to
 _FIRST_STEPS, _ROUND_STEPS = 12, 40  # before the median has settled
 _CONVERGED = 0.01
-_LEAST_POSITIONS = 6
-_MAX_PRUNED = 0.3  # of the edges: more of them over the limit speak of the block, not of the edges
-_FAR = 10.0  # times the limit of an edge: no bent block explains it
 _LEAST_OBSERVATIONS = 3  # of an image: fewer do not fix a pose
 
 
@@ -108,7 +98,7 @@ def adjust(
     if block.num_images < 2:
         raise JaxbaError(f"The block has {block.num_images} images with start values; an adjustment needs two or more.")
     control = Control.nothing() if control is None else control
-    rounds = _Rounds(anchor=block, reference=reference, photos=photos, settings=settings, control=control)
+    rounds = Rounds(anchor=block, reference=reference, photos=photos, settings=settings, control=control)
     if not block.num_points:
         limit = 4 * settings.track_threshold
         block = apply_points(block, tracks, triangulate_tracks(block, tracks, settings.min_angle_rad, limit))
@@ -143,7 +133,7 @@ def adjust(
         found, limit_px = judge(block, tracks, solved.error_px, limit_px, settings)
         if len(medians) > 1:  # what the first round's held intrinsics leave is no edge's fault
             edge_px = edge_medians_px(matches, found, len(view_graph.pairs), tracks.num_observations)
-            worst, warnings = _edges_to_prune(view_graph, edge_px, settings.edge_median_limit, photos)
+            worst, warnings = edges_to_prune(view_graph, edge_px, settings.edge_median_limit, photos)
             notes = warnings
             if worst:
                 gone[list(worst)] = True
@@ -199,204 +189,9 @@ def _completed(
     return complete_tracks(block, tracks, features, tuple(photos), radius_px=settings.complete_radius)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Solved:
-    block: Block
-    error_px: Float[np.ndarray, " observations"]
-    problem: Problem
-    loss: AbstractLoss
-    solution: Solution
-    position_scale: Float[np.ndarray, "3"]
-    gnss_offset_m: Float[np.ndarray, "3"]
-    control: ControlPart | None
-
-
-@dataclasses.dataclass(frozen=True)
-class _Rounds:
-    """What all rounds share; `anchor` is the block at the start."""
-
-    anchor: Block
-    reference: Reference
-    photos: Sequence[Photo]
-    settings: Settings
-    control: Control
-
-    def solve(
-        self,
-        block: Block,
-        std_px: float,
-        free: Sequence[str],
-        mark_used: Bool[np.ndarray, " marks"],
-        shape: Shape | None,
-        *,
-        max_nfev: int,
-        is_later: bool,
-    ) -> _Solved:
-        """Solve a block; `free` are the camera's parameters that may change, `shape` has the least sizes.
-
-        - `mark_used`: of all marks of control. `is_later`: than the first round.
-        """
-        settings = self.settings
-        model = LOSSES[settings.loss]
-        loss = Linear() if model is Linear else model(f_scale=settings.f_scale / std_px)  # type: ignore[call-arg]
-        scale = position_scale(block, self.reference)
-        scale_of_control = None
-        if is_later and self.control.num_points:
-            is_free = int(used_positions(block, self.reference).sum()) < LEAST_TO_PLACE
-            scale_of_control = control_scale(block, self.control, mark_used, is_free=is_free)
-        control = control_part(block, self.control, mark_used, scale_of_control)
-        offset_m = gnss_offset(block, self.reference, control, is_later=is_later)
-        reference = with_offset(self.reference, offset_m)
-        held = [name for name in CAMERAS[block.camera_model].parameter_names() if name not in free]
-
-        def problem_of(block: Block, control: ControlPart | None) -> Problem:
-            return to_problem(
-                block,
-                reference,
-                self.photos,
-                anchor=self.anchor,
-                std_px=std_px,
-                position_scale=scale,
-                held=held,
-                control=control,
-            )
-
-        problem = problem_of(block, control)
-        plan = make_plan(problem, like=shape)
-        solution = solve(
-            problem,
-            loss=loss,
-            plan=plan,
-            max_nfev=max_nfev,
-            ftol=settings.ftol,
-            xtol=settings.xtol,
-        )
-        num_points, num_own = block.num_points, block.num_observations
-        block = with_solution(block, solution)
-        if control is not None:
-            control = dataclasses.replace(control, start_m=np.asarray(solution.points)[num_points:])
-        problem = solution.apply(problem)
-        error_px = reprojection_errors(problem)
-        fits = np.isfinite(error_px)
-        if solution.report is not None:
-            fits &= ~solution.report.dropped.observations
-        if not fits[:num_own].all():
-            block = _with_observations(block, fits[:num_own])
-            problem = problem_of(block, control)
-            error_px = reprojection_errors(problem)
-        error_px = error_px[: block.num_observations]
-        return _Solved(block, error_px, problem, loss, solution, scale, offset_m, control)
-
-    def shape(self, block: Block, tracks: Tracks) -> Shape:
-        """Return the shape of the block with every observation that may ever join it: all rounds share it."""
-        row, image_row, of_track, index = track_rows(block, tracks)
-        full = dataclasses.replace(
-            block,
-            points_m=np.zeros((len(index), 3)),
-            track_index=index,
-            rgb=tracks.rgb[index],
-            observation_image=image_row,
-            observation_point=of_track,
-            observation_xy_px=tracks.xy_px[row],
-        )
-        control = control_part(block, self.control, np.ones(len(self.control.mark_point), bool))
-        problem = to_problem(full, self.reference, self.photos, anchor=self.anchor, control=control)
-        return make_plan(problem, spare=_SPARE).shape
-
-
-def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:
-    """Return what the sigmas of positions are multiplied by, an axis, from how the positions scatter about the block.
-
-    The median of |residual| over 0.6745 sigma (its value for a normal distribution), and not below 1: positions may be
-    worse than they claim. Sigmas of more than `PLAIN_M` are those of a single receiver, mostly an offset that all
-    positions of a flight have in common; their scatter alone tells their weight against each other, down to a tenth.
-    Under six positions it is 1.
-    """
-    used = used_positions(block, reference)
-    index = block.image_index[used]
-    scale = np.ones(3)
-    for axis in range(3):
-        std = reference.std_m[index, axis]
-        known = np.isfinite(std)
-        if known.sum() < _LEAST_POSITIONS:
-            continue
-        residual = block.centers_m[used, axis] - reference.xyz_m[index, axis]
-        ratio = np.median(np.abs(residual - np.median(residual))[known] / std[known]) / 0.6745
-        ratio *= np.sqrt(known.sum() / (known.sum() - 7 / 3))  # a similarity has fitted the block to them
-        scale[axis] = max(ratio, 0.1 if np.median(std[known]) > PLAIN_M else 1.0)
-    return scale
-
-
-def without_images(block: Block, gone: Bool[np.ndarray, " images"]) -> Block:
-    """Return the block without some images, without their observations, and without points left with fewer than two."""
-    keep = ~gone
-    number = np.cumsum(keep) - 1
-    seen = keep[block.observation_image]
-    block = _with_observations(block, seen)
-    return dataclasses.replace(
-        block,
-        image_index=block.image_index[keep],
-        quaternion=block.quaternion[keep],
-        translation_m=block.translation_m[keep],
-        camera_index=block.camera_index[keep],
-        observation_image=number[block.observation_image],
-    )
-
-
-def _edges_to_prune(
-    view_graph: ViewGraph, median_px: Float[np.ndarray, " edges"], limit_px: float, photos: Sequence[Photo]
-) -> tuple[dict[int, Left], list[str]]:
-    """Return the edges over the limit with the reason, or none of them and a warning where they are too many.
-
-    A wrong edge pulls its two images off, and right edges of theirs go over the limit with it: of those near the limit
-    only the worst one at each image is pruned in a round.
-    """
-    over = np.flatnonzero(median_px > limit_px)
-    judged = int(np.isfinite(median_px).sum())
-    if len(over) > max(_MAX_PRUNED * judged, 1):
-        return {}, [
-            f"{len(over)} of {judged} edges are off by more than {limit_px:g} px in their median: the "
-            "block does not fit together, so none was left out. Check the focal length against the sensor's "
-            "specification, and that photos of different cameras or zooms are not mixed."
-        ]
-    pruned, touched = {}, set[int]()
-    for k in over[np.argsort(-median_px[over], kind="stable")]:
-        images = {int(i) for i in view_graph.pairs[k]}
-        if touched & images and median_px[k] < _FAR * limit_px:
-            continue
-        touched |= images
-        first, second = (photos[i].name for i in view_graph.pairs[k])
-        pruned[int(k)] = Left(
-            name=f"{first}, {second}",
-            reason=f"their {view_graph.num_inliers[k]} matches are off by {_px(float(median_px[k]))} in the median "
-            f"(limit {limit_px:g} px) and were left out; look at both photos for repeated patterns or movement",
-        )
-    return pruned, []
-
-
-def _px(error: float) -> str:
-    return f"{error:.1f} px" if error < 100 else "over 100 px"
-
-
 def _lost(name: str) -> Left:
     return Left(
         name=name,
         reason=f"fewer than {_LEAST_OBSERVATIONS} of its features fit the adjusted block; its matches may be wrong, or "
         "lie on something that moves",
-    )
-
-
-def _with_observations(block: Block, keep: Bool[np.ndarray, " observations"]) -> Block:
-    """Return the block with some of its observations, and the points that two or more of these see."""
-    keep = keep & (np.bincount(block.observation_point[keep], minlength=block.num_points)[block.observation_point] >= 2)
-    seen = np.bincount(block.observation_point[keep], minlength=block.num_points) > 0
-    number = np.cumsum(seen) - 1
-    return dataclasses.replace(
-        block,
-        points_m=block.points_m[seen],
-        track_index=block.track_index[seen],
-        rgb=block.rgb[seen],
-        observation_image=block.observation_image[keep],
-        observation_point=number[block.observation_point[keep]],
-        observation_xy_px=block.observation_xy_px[keep],
     )

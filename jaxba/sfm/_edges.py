@@ -7,17 +7,20 @@ edge is near 1.6 s.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from jaxba.scene import Tracks, ViewGraph
+from jaxba.scene import Left, Photo, Tracks, ViewGraph
 from jaxba.sfm._points import Triangulated
 from jaxba.sfm._rays import Rays
 
 _LEAST_MATCHES = 5  # fewer have no median to speak of
+_MAX_PRUNED = 0.3  # of the edges: more of them over the limit speak of the block, not of the edges
+_FAR = 10.0  # times the limit of an edge: no bent block explains it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,3 +133,38 @@ def without_edges(tracks: Tracks, matches: MatchRows, pruned: Bool[np.ndarray, "
         rgb=rgb,
     )
     return changed, MatchRows(matches.edge, moved[matches.first], moved[matches.second])
+
+
+def edges_to_prune(
+    view_graph: ViewGraph, median_px: Float[np.ndarray, " edges"], limit_px: float, photos: Sequence[Photo]
+) -> tuple[dict[int, Left], list[str]]:
+    """Return the edges over the limit with the reason, or none of them and a warning where they are too many.
+
+    A wrong edge pulls its two images off, and right edges of theirs go over the limit with it: of those near the limit
+    only the worst one at each image is pruned in a round.
+    """
+    over = np.flatnonzero(median_px > limit_px)
+    judged = int(np.isfinite(median_px).sum())
+    if len(over) > max(_MAX_PRUNED * judged, 1):
+        return {}, [
+            f"{len(over)} of {judged} edges are off by more than {limit_px:g} px in their median: the "
+            "block does not fit together, so none was left out. Check the focal length against the sensor's "
+            "specification, and that photos of different cameras or zooms are not mixed."
+        ]
+    pruned, touched = {}, set[int]()
+    for k in over[np.argsort(-median_px[over], kind="stable")]:
+        images = {int(i) for i in view_graph.pairs[k]}
+        if touched & images and median_px[k] < _FAR * limit_px:
+            continue
+        touched |= images
+        first, second = (photos[i].name for i in view_graph.pairs[k])
+        pruned[int(k)] = Left(
+            name=f"{first}, {second}",
+            reason=f"their {view_graph.num_inliers[k]} matches are off by {_px(float(median_px[k]))} in the median "
+            f"(limit {limit_px:g} px) and were left out; look at both photos for repeated patterns or movement",
+        )
+    return pruned, []
+
+
+def _px(error: float) -> str:
+    return f"{error:.1f} px" if error < 100 else "over 100 px"

@@ -1,0 +1,189 @@
+"""One round of the adjustment: the problem of a block with what was measured beside it, solved; all share one shape."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxba.ba import Problem, Solution, make_plan, reprojection_errors, solve
+from jaxba.ba._plan import Shape
+from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
+from jaxba.scene import Block, Control, Photo, Reference, Tracks
+from jaxba.sfm._control import (
+    LEAST_TO_PLACE,
+    PLAIN_M,
+    ControlPart,
+    control_part,
+    control_scale,
+    gnss_offset,
+    with_offset,
+)
+from jaxba.sfm._points import track_rows
+from jaxba.sfm._problem import to_problem, used_positions, with_solution
+from jaxba.sfm._settings import Settings
+
+_SPARE = 0.03  # room for tracks that pruning cuts in two
+_LEAST_POSITIONS = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Solved:
+    """What a round made: see `Adjusted` for the fields."""
+
+    block: Block
+    error_px: Float[np.ndarray, " observations"]
+    problem: Problem
+    loss: AbstractLoss
+    solution: Solution
+    position_scale: Float[np.ndarray, "3"]
+    gnss_offset_m: Float[np.ndarray, "3"]
+    control: ControlPart | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Rounds:
+    """What all rounds share; `anchor` is the block at the start."""
+
+    anchor: Block
+    reference: Reference
+    photos: Sequence[Photo]
+    settings: Settings
+    control: Control
+
+    def solve(
+        self,
+        block: Block,
+        std_px: float,
+        free: Sequence[str],
+        mark_used: Bool[np.ndarray, " marks"],
+        shape: Shape | None,
+        *,
+        max_nfev: int,
+        is_later: bool,
+    ) -> Solved:
+        """Solve a block; `free` are the camera's parameters that may change, `shape` has the least sizes.
+
+        - `mark_used`: of all marks of control. `is_later`: than the first round.
+        """
+        settings = self.settings
+        model = LOSSES[settings.loss]
+        loss = Linear() if model is Linear else model(f_scale=settings.f_scale / std_px)  # type: ignore[call-arg]
+        scale = position_scale(block, self.reference)
+        scale_of_control = None
+        if is_later and self.control.num_points:
+            is_free = int(used_positions(block, self.reference).sum()) < LEAST_TO_PLACE
+            scale_of_control = control_scale(block, self.control, mark_used, is_free=is_free)
+        control = control_part(block, self.control, mark_used, scale_of_control)
+        offset_m = gnss_offset(block, self.reference, control, is_later=is_later)
+        reference = with_offset(self.reference, offset_m)
+        held = [name for name in CAMERAS[block.camera_model].parameter_names() if name not in free]
+
+        def problem_of(block: Block, control: ControlPart | None) -> Problem:
+            return to_problem(
+                block,
+                reference,
+                self.photos,
+                anchor=self.anchor,
+                std_px=std_px,
+                position_scale=scale,
+                held=held,
+                control=control,
+            )
+
+        problem = problem_of(block, control)
+        plan = make_plan(problem, like=shape)
+        solution = solve(
+            problem,
+            loss=loss,
+            plan=plan,
+            max_nfev=max_nfev,
+            ftol=settings.ftol,
+            xtol=settings.xtol,
+        )
+        num_points, num_own = block.num_points, block.num_observations
+        block = with_solution(block, solution)
+        if control is not None:
+            control = dataclasses.replace(control, start_m=np.asarray(solution.points)[num_points:])
+        problem = solution.apply(problem)
+        error_px = reprojection_errors(problem)
+        fits = np.isfinite(error_px)
+        if solution.report is not None:
+            fits &= ~solution.report.dropped.observations
+        if not fits[:num_own].all():
+            block = with_observations(block, fits[:num_own])
+            problem = problem_of(block, control)
+            error_px = reprojection_errors(problem)
+        error_px = error_px[: block.num_observations]
+        return Solved(block, error_px, problem, loss, solution, scale, offset_m, control)
+
+    def shape(self, block: Block, tracks: Tracks) -> Shape:
+        """Return the shape of the block with every observation that may ever join it: all rounds share it."""
+        row, image_row, of_track, index = track_rows(block, tracks)
+        full = dataclasses.replace(
+            block,
+            points_m=np.zeros((len(index), 3)),
+            track_index=index,
+            rgb=tracks.rgb[index],
+            observation_image=image_row,
+            observation_point=of_track,
+            observation_xy_px=tracks.xy_px[row],
+        )
+        control = control_part(block, self.control, np.ones(len(self.control.mark_point), bool))
+        problem = to_problem(full, self.reference, self.photos, anchor=self.anchor, control=control)
+        return make_plan(problem, spare=_SPARE).shape
+
+
+def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:
+    """Return what the sigmas of positions are multiplied by, an axis, from how the positions scatter about the block.
+
+    The median of |residual| over 0.6745 sigma (its value for a normal distribution), and not below 1: positions may be
+    worse than they claim. Sigmas of more than `PLAIN_M` are those of a single receiver, mostly an offset that all
+    positions of a flight have in common; their scatter alone tells their weight against each other, down to a tenth.
+    Under six positions it is 1.
+    """
+    used = used_positions(block, reference)
+    index = block.image_index[used]
+    scale = np.ones(3)
+    for axis in range(3):
+        std = reference.std_m[index, axis]
+        known = np.isfinite(std)
+        if known.sum() < _LEAST_POSITIONS:
+            continue
+        residual = block.centers_m[used, axis] - reference.xyz_m[index, axis]
+        ratio = np.median(np.abs(residual - np.median(residual))[known] / std[known]) / 0.6745
+        ratio *= np.sqrt(known.sum() / (known.sum() - 7 / 3))  # a similarity has fitted the block to them
+        scale[axis] = max(ratio, 0.1 if np.median(std[known]) > PLAIN_M else 1.0)
+    return scale
+
+
+def without_images(block: Block, gone: Bool[np.ndarray, " images"]) -> Block:
+    """Return the block without some images, without their observations, and without points left with fewer than two."""
+    keep = ~gone
+    number = np.cumsum(keep) - 1
+    seen = keep[block.observation_image]
+    block = with_observations(block, seen)
+    return dataclasses.replace(
+        block,
+        image_index=block.image_index[keep],
+        quaternion=block.quaternion[keep],
+        translation_m=block.translation_m[keep],
+        camera_index=block.camera_index[keep],
+        observation_image=number[block.observation_image],
+    )
+
+
+def with_observations(block: Block, keep: Bool[np.ndarray, " observations"]) -> Block:
+    """Return the block with some of its observations, and the points that two or more of these see."""
+    keep = keep & (np.bincount(block.observation_point[keep], minlength=block.num_points)[block.observation_point] >= 2)
+    seen = np.bincount(block.observation_point[keep], minlength=block.num_points) > 0
+    number = np.cumsum(seen) - 1
+    return dataclasses.replace(
+        block,
+        points_m=block.points_m[seen],
+        track_index=block.track_index[seen],
+        rgb=block.rgb[seen],
+        observation_image=block.observation_image[keep],
+        observation_point=number[block.observation_point[keep]],
+        observation_xy_px=block.observation_xy_px[keep],
+    )

@@ -22,7 +22,7 @@ def data_dir() -> Path:
     return path
 
 
-_LARGE = {"test_solve", "test_recovery", "test_cli", "test_adjoint"}  # run real sizes, which optimised code pays for
+_LARGE = {"test_solve", "test_recovery", "test_cli"}  # run real sizes, which optimised code pays for
 # share a survey that one process has run, and hold results to its last bit: code compiled otherwise rounds otherwise
 _LARGE |= {"test_contract", "test_runner", "test_cli_run", "test_bad_input", "test_truth", "test_status"}
 _LARGE |= {"test_killed", "test_verify", "test_diagnose"}

@@ -10,6 +10,7 @@ against forward mode by `<w, dx> = <grad, d>` for a random w.
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -150,18 +151,16 @@ def _rows(problem: Problem, loss: AbstractLoss, plan: Plan, rng: np.random.Gener
         found = solve(of_problem, loss=of_loss, plan=plan, adjoint=adjoint, **_TIGHT)
         return _values(found), found.final_cost
 
-    def derivative(direction: dict[str, Any], adjoint: Adjoint) -> tuple[Float[np.ndarray, " unknowns"], float]:
-        dot, cost_dot = jax.jvp(lambda v: outputs(v, adjoint), (values,), (direction,))[1]
-        return _tangent(problem, jax.device_get(dot)), float(cost_dot)
-
+    (optimum, _), push = jax.linearize(outputs, values)
+    _, approximately = jax.linearize(functools.partial(outputs, adjoint="gauss_newton"), values)
     cotangent = rng.normal(size=weights.shape) * weights
-    (optimum, _), pull = jax.vjp(outputs, values)
+    pull = jax.linear_transpose(push, values)
     gradient = pull((_pull_back(problem, cotangent, optimum), jnp.zeros(())))[0]
     for name, an_input in inputs.items():
         along = rng.normal(size=values[name].shape) * an_input.scale
         direction = {n: along if n == name else np.zeros_like(v) for n, v in values.items()}
-        found, cost_dot = derivative(direction, "implicit")
-        approximate, _ = derivative(direction, "gauss_newton")
+        dot, cost_dot = push(direction)
+        found, approximate = (_tangent(problem, jax.device_get(d)) for d in (dot, approximately(direction)[0]))
         step = min(_LARGEST_STEP, _MOVES / max(float(np.linalg.norm(weights * found)), _TINY))
         differences = []
         for share in _SHARES:
@@ -182,7 +181,7 @@ def _rows(problem: Problem, loss: AbstractLoss, plan: Plan, rng: np.random.Gener
             name=name,
             size=int(np.count_nonzero(np.broadcast_to(an_input.scale, along.shape))),
             moved=size,
-            error=max(error, abs(cost_dot - cost_difference) / cost_size),
+            error=max(error, abs(float(cost_dot) - cost_difference) / cost_size),
             reverse_error=reverse_error / max(float(np.linalg.norm(cotangent * found)), _TINY),
             gauss_newton_error=float(np.linalg.norm(weights * approximate - difference)) / size,
         )

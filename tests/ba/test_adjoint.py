@@ -137,12 +137,12 @@ def test_cost_and_residuals_have_derivatives(block: Problem):
         camera = jax.tree.map(lambda a: a[0], solution.cameras)
         return solution.final_cost, camera.project(pose.transform(solution.points[3]))
 
-    std, step = np.asarray(block.observations.std_px), 1e-5
+    std, step = np.asarray(block.observations.std_px), 1e-3  # shorter ones drown in the last digits of the optima
     direction = np.random.default_rng(1).normal(size=std.shape)
     found = jax.jvp(at, (std,), (direction,))[1]
     high, low = (jax.jvp(at, (std + s * direction,), (direction,))[0] for s in (step, -step))
     for a, b, c in zip(found, high, low, strict=True):
-        np.testing.assert_allclose(a, (np.asarray(b) - np.asarray(c)) / (2 * step), rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(a, (np.asarray(b) - np.asarray(c)) / (2 * step), rtol=2e-4)
 
 
 def test_a_point_on_a_saddle_is_held_and_told():

@@ -25,6 +25,13 @@ def outcomes(call, todo: list[Item], resources: Resources) -> dict[str, tuple[ob
     return dict(ended)
 
 
+def is_worker(process: psutil.Process) -> bool:
+    try:
+        return "spawn_main" in " ".join(process.cmdline())
+    except psutil.NoSuchProcess:  # it has ended since it was listed
+        return False
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_every_item_has_its_result(workers):
     found = outcomes(double, items(*range(6)), Resources(workers=workers))
@@ -58,7 +65,7 @@ def test_no_item_is_lost_while_workers_are_killed_again_and_again():
     def kill() -> None:
         seen = 0
         while not stop.wait(0.2):
-            alive = [child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline())]
+            alive = [child for child in psutil.Process().children() if is_worker(child)]
             if alive and len(found) > seen and len(kills) < 4:  # an item has ended since
                 seen = len(found)
                 kills.append(alive[len(kills) % len(alive)].pid)

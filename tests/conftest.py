@@ -1,7 +1,11 @@
-"""Every test runs in float64, with the shapes and types of each annotated function and class checked at run time."""
+"""Every test runs in float64, with the shapes and types of each annotated function and class checked at run time.
+
+What one process of a session has compiled, the others and the commands that tests start do not compile again.
+"""
 
 import gc
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +14,16 @@ import jaxtyping
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+_cache: tempfile.TemporaryDirectory[str] | None = None  # lasts as long as the session's first process
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _cache = tempfile.TemporaryDirectory(prefix="jaxba-compiled-")
+    for name, value in (
+        ("jax_compilation_cache_dir", _cache.name),
+        ("jax_persistent_cache_min_compile_time_secs", 0.0),
+        ("jax_persistent_cache_min_entry_size_bytes", -1),
+    ):
+        jax.config.update(name, value)
+        os.environ[name.upper()] = str(value)
 jaxtyping.install_import_hook("jaxba", "beartype.beartype")  # works only on modules that are not imported yet
 
 

@@ -25,12 +25,6 @@ Answer = tuple[int, str, str]
 Cli = Callable[..., Answer]
 
 
-@pytest.fixture(autouse=True)
-def no_compilation_cache(monkeypatch: pytest.MonkeyPatch):
-    """The commands run in this process: leave its compilation cache as it is."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-
-
 @pytest.fixture
 def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
     """Run a command; return its exit code, standard output and standard error."""

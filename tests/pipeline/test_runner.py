@@ -224,7 +224,9 @@ def test_an_export_folder_that_was_removed_is_written_again(made: Survey, tmp_pa
 
 
 def test_parameters_of_the_last_run_lie_in_the_project(made: Survey):
-    assert from_toml(made.project / "jaxba.toml", default_settings()) == changed(default_settings(), [*FAST, "workers.workers=2"])
+    assert from_toml(made.project / "jaxba.toml", default_settings()) == changed(
+        default_settings(), [*FAST, "workers.workers=2"]
+    )
 
 
 def test_a_project_folder_is_not_the_photo_folder(photos: Path):

@@ -3,8 +3,9 @@
 `import jaxba` takes milliseconds and loads no jax: a public name loads its module when it is first used (PEP 562).
 """
 
-import importlib
 from typing import TYPE_CHECKING
+
+from jaxba._lazy import lazy
 
 __version__ = "0.1.0"
 
@@ -140,17 +141,4 @@ if TYPE_CHECKING:
 
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
-
-def __getattr__(name: str) -> object:
-    if name in _MODULE_OF:
-        value = getattr(importlib.import_module(_MODULE_OF[name]), name)
-    elif name in _MODULES:
-        value = importlib.import_module(_MODULES[name])
-    else:
-        raise AttributeError(f"module 'jaxba' has no attribute {name!r}")
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*(name for name in globals() if name.startswith("__")), *_MODULE_OF, *_MODULES})
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF, _MODULES)

@@ -4,9 +4,9 @@
 problems load it when they are first used (PEP 562).
 """
 
-import importlib
 from typing import TYPE_CHECKING
 
+from jaxba._lazy import lazy
 from jaxba.io._atomic import refuse_same_file, write_atomically
 
 if TYPE_CHECKING:
@@ -73,13 +73,4 @@ _MODULE_OF = {
     "write_tile": "jaxba.io._tile",
 }
 
-
-def __getattr__(name: str) -> object:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'jaxba.io' has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(_MODULE_OF[name]), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF)

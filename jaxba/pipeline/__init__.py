@@ -3,8 +3,9 @@
 `import jaxba.pipeline` loads nothing else: a worker that runs one stage loads that stage alone (PEP 562).
 """
 
-import importlib
 from typing import TYPE_CHECKING
+
+from jaxba._lazy import lazy
 
 if TYPE_CHECKING:
     from jaxba.pipeline._events import Event, Run
@@ -21,32 +22,23 @@ __all__ = [
 ]  # fmt: skip
 
 _MODULE_OF = {
-    "NAMES": "_stages",
-    "STAGES": "_stages",
-    "Event": "_events",
-    "Resources": "_workers",
-    "Run": "_events",
-    "Settings": "_settings",
-    "Status": "_status",
-    "changed": "_settings",
-    "default_settings": "_settings",
-    "explained": "_settings",
-    "from_toml": "_settings",
-    "project_settings": "_status",
-    "run_pipeline": "_runner",
-    "stage_lines": "_summary",
-    "status": "_status",
-    "summary": "_summary",
-    "to_toml": "_settings",
+    "NAMES": "jaxba.pipeline._stages",
+    "STAGES": "jaxba.pipeline._stages",
+    "Event": "jaxba.pipeline._events",
+    "Resources": "jaxba.pipeline._workers",
+    "Run": "jaxba.pipeline._events",
+    "Settings": "jaxba.pipeline._settings",
+    "Status": "jaxba.pipeline._status",
+    "changed": "jaxba.pipeline._settings",
+    "default_settings": "jaxba.pipeline._settings",
+    "explained": "jaxba.pipeline._settings",
+    "from_toml": "jaxba.pipeline._settings",
+    "project_settings": "jaxba.pipeline._status",
+    "run_pipeline": "jaxba.pipeline._runner",
+    "stage_lines": "jaxba.pipeline._summary",
+    "status": "jaxba.pipeline._status",
+    "summary": "jaxba.pipeline._summary",
+    "to_toml": "jaxba.pipeline._settings",
 }
 
-
-def __getattr__(name: str) -> object:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'jaxba.pipeline' has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(f"jaxba.pipeline.{_MODULE_OF[name]}"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF)

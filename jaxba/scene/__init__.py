@@ -4,9 +4,9 @@
 loads it when it is first used (PEP 562).
 """
 
-import importlib
 from typing import TYPE_CHECKING
 
+from jaxba._lazy import lazy
 from jaxba.scene._attitude import Attitude, cam_from_enu
 from jaxba.scene._block import Block
 from jaxba.scene._candidates import joining_pairs, nearest_pairs, window_pairs
@@ -30,15 +30,6 @@ __all__ = [
     "joining_pairs", "nearest_pairs", "uav_block", "window_pairs",
 ]  # fmt: skip
 
-_SYNTHETIC = ("DRONE_CAMERA", "Survey", "Truth", "uav_block")
+_MODULE_OF = {name: "jaxba.scene.synthetic" for name in ("DRONE_CAMERA", "Survey", "Truth", "uav_block")}
 
-
-def __getattr__(name: str) -> object:
-    if name not in _SYNTHETIC:
-        raise AttributeError(f"module 'jaxba.scene' has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module("jaxba.scene.synthetic"), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF)

@@ -4,8 +4,9 @@
 simulated photos need jax.
 """
 
-import importlib
 from typing import TYPE_CHECKING
+
+from jaxba._lazy import lazy
 
 if TYPE_CHECKING:
     from jaxba.vision._attitude_tags import attitude_from_nadir_body
@@ -57,13 +58,4 @@ _MODULE_OF = {
     "verify": "jaxba.vision._two_view",
 }
 
-
-def __getattr__(name: str) -> object:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'jaxba.vision' has no attribute {name!r}")
-    globals()[name] = value = getattr(importlib.import_module(_MODULE_OF[name]), name)
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF)

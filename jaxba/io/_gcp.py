@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
 from jaxba.io._list_text import (
-    CRS_COLUMN,
+    PLACE_COLUMNS,
     Line,
     columns_by_name,
     content_lines,
@@ -32,20 +32,13 @@ from jaxba.io._list_text import (
 )
 
 _COLUMNS = {
+    **PLACE_COLUMNS,
     "image": ("image", "imagename", "image_name", "filename", "file_name", "file", "photo", "photo_name"),
     "name": ("name", "gcp", "gcp_name", "point", "point_name", "label", "id", "point_id", "gcp_label"),
-    "longitude": ("longitude", "lon", "long", "lng"),
-    "latitude": ("latitude", "lat"),
-    "x": ("x", "easting", "east", "geo_x", "x_easting"),
-    "y": ("y", "northing", "north", "geo_y", "y_northing"),
-    "z": ("z", "height", "altitude", "elevation", "alt", "geo_z", "z_altitude"),
     "px": ("px", "im_x", "image_x", "pixel_x", "x_px", "col", "column", "u"),
     "py": ("py", "im_y", "image_y", "pixel_y", "y_px", "row", "line", "v"),
-    "std_h": ("std_h", "std_h_m", "horizontal_accuracy", "h_accuracy", "accuracy_horizontal", "h_acc"),
-    "std_v": ("std_v", "std_v_m", "vertical_accuracy", "v_accuracy", "accuracy_vertical", "v_acc"),
     "role": ("role", "type", "kind", "usage"),
-    "crs": CRS_COLUMN,
-}  # fmt: skip
+}
 _CHECK, _CONTROL = ("check", "checkpoint", "check_point", "cp", "ckp"), ("control", "gcp", "control_point", "")
 _PLACE = ("crs", "x", "y", "z_m", "std_h_m", "std_v_m", "is_check")
 

@@ -22,7 +22,7 @@ from statistics import median
 
 from jaxba._errors import JaxbaError
 from jaxba.io._list_text import (
-    CRS_COLUMN,
+    PLACE_COLUMNS,
     Line,
     columns_by_name,
     content_lines,
@@ -37,27 +37,14 @@ from jaxba.scene import Position
 from jaxba.scene._photo import HeightKind
 
 _COLUMNS = {
+    **PLACE_COLUMNS,
     "name": (
         "name", "image", "imagename", "image_name", "filename", "file_name", "file", "photo", "label", "sourcefile",
     ),
-    "latitude": ("latitude", "lat"),
-    "longitude": ("longitude", "lon", "long", "lng"),
-    "x": ("x", "easting", "east", "x_easting"),
-    "y": ("y", "northing", "north", "y_northing"),
-    "z": ("z", "altitude", "alt", "height", "elevation", "z_altitude"),
     "ellipsoidal": ("ellipsoidal_height", "height_ellipsoidal", "ellipsoid_height"),
     "yaw": ("yaw", "heading"),
     "pitch": ("pitch",),
     "roll": ("roll",),
-    "horizontal": (
-        "horizontal_accuracy", "h_acc", "h_accuracy", "accuracy_horizontal", "horz_accuracy", "std_h", "std_h_m",
-        "accuracy_horz",
-    ),
-    "vertical": (
-        "vertical_accuracy", "v_acc", "v_accuracy", "accuracy_vertical", "vert_accuracy", "std_v", "std_v_m",
-        "accuracy_vert",
-    ),
-    "crs": CRS_COLUMN,
 }  # fmt: skip
 _GIMBAL_PITCH_DEG = -30.0
 
@@ -179,7 +166,7 @@ def _read_csv(
         if z_m is None and (z_m := value("ellipsoidal")) is not None:
             kind = "ellipsoidal"
         angles = [value("yaw"), value("pitch"), value("roll")]
-        accuracies = [value("horizontal"), value("vertical")]
+        accuracies = [value("std_h"), value("std_v")]
         entries.append(_entry(cell("name"), line, where, crs, kind, x, y, z_m, angles, accuracies))
     return entries, notes
 

@@ -15,7 +15,24 @@ from jaxba.scene._photo import HeightKind
 Line = tuple[int, str]
 """Number of a line, from 1, and its text."""
 
-CRS_COLUMN = ("crs", "srs", "epsg")
+PLACE_COLUMNS = {
+    "longitude": ("longitude", "lon", "long", "lng"),
+    "latitude": ("latitude", "lat"),
+    "x": ("x", "easting", "east", "geo_x", "x_easting"),
+    "y": ("y", "northing", "north", "geo_y", "y_northing"),
+    "z": ("z", "height", "altitude", "elevation", "alt", "geo_z", "z_altitude"),
+    "std_h": (
+        "std_h", "std_h_m", "horizontal_accuracy", "h_accuracy", "h_acc", "accuracy_horizontal", "horz_accuracy",
+        "accuracy_horz",
+    ),
+    "std_v": (
+        "std_v", "std_v_m", "vertical_accuracy", "v_accuracy", "v_acc", "accuracy_vertical", "vert_accuracy",
+        "accuracy_vert",
+    ),
+    "crs": ("crs", "srs", "epsg"),
+}  # fmt: skip
+"""Titles of the columns that say where something is, as `plain_title` writes them."""
+
 _UTM = re.compile(r"WGS\s*_?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 
 

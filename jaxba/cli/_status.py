@@ -49,6 +49,8 @@ def _print(found: Status) -> None:
         more = f"; and {len(found.rejected) - _SHOWN} more, see --json" if len(found.rejected) > _SHOWN else ""
         rows.append(("rejected", f"{len(found.rejected)} pairs without an edge: {names}{more}"))
     rows += [("run", found.activity)] if found.activity else []
-    print()
-    for label, text in rows or [("all", "every photo is in use, and every pair")]:
+    if not rows and found.is_done:
+        rows = [("all", "every photo is in use, and every pair")]
+    print(end="\n" if rows else "")
+    for label, text in rows:
         print(wrapped(label, text, _LABEL))

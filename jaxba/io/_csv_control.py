@@ -54,7 +54,7 @@ def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None
     for k, name in enumerate(table.names):
         numbers = [*table.surveyed[k], *table.adjusted[k], *table.residual_m[k], *table.std_m[k]]
         cells = [
-            f'"{name}"' if set(name) & set(',"; ') else name,
+            '"' + name.replace('"', '""') + '"' if set(name) & set(',"; ') else name,
             "check" if table.is_check[k] else "control",
             str(table.num_marks[k]),
             *(_cell(value, 4) for value in numbers),

@@ -13,6 +13,7 @@ coordinates in metres as `std_h`, `std_v`; `role`, control or check. The CRS sta
 as `# EPSG:32615` on the first line; latitude and longitude are EPSG:4326 without one.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -62,6 +63,7 @@ class SurveyedPoint:
 
     - `crs`, `x`, `y`: east or longitude first. `z_m`: in the list's own unit and height system; None where it has none.
     - `std_h_m`, `std_v_m`: None where the list states none. `is_check`: its role says so. `source`: file and line.
+    - `is_named`: by the list; else it was given a number.
     """
 
     name: str
@@ -74,6 +76,7 @@ class SurveyedPoint:
     std_v_m: float | None = None
     is_check: bool = False
     source: str = ""
+    is_named: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,10 +95,10 @@ class _Row:
     point: SurveyedPoint
 
 
-def parse_control(text: str, name: str = "gcp_list.txt") -> ControlList:
+def parse_control(text: str, name: str = "gcp_list.txt", unnamed: str = "point") -> ControlList:
     """Return the points of a gcp_list.txt or CSV, each with its marks.
 
-    - `name`: of the file, for messages.
+    - `name`: of the file, for messages. `unnamed`: what points without a name are called, with a number.
 
     Raises `JaxbaError` with file, line, field and value for what cannot be read, for a name with two places, and for a
     point that is marked twice in one photo.
@@ -115,7 +118,7 @@ def parse_control(text: str, name: str = "gcp_list.txt") -> ControlList:
         rows = _read_list(content, name)
     if not rows:
         raise JaxbaError(f"{name}: lists no mark; give a line a mark below the first, or leave the list away.")
-    return ControlList(points=_points(rows), notes=tuple(notes))
+    return ControlList(points=_points(rows, unnamed), notes=tuple(notes))
 
 
 def _read_list(content: list[Line], name: str) -> list[_Row]:
@@ -203,11 +206,11 @@ def _row(
     return _Row(name=name, point=point)
 
 
-def _points(rows: list[_Row]) -> tuple[SurveyedPoint, ...]:
+def _points(rows: list[_Row], unnamed: str) -> tuple[SurveyedPoint, ...]:
     """Return rows joined by name, or by coordinates where they have none."""
     named = {row.name for row in rows}
     by_place = {_place(row.point)[:4]: row.name for row in reversed(rows) if row.name}
-    free_names = (f"point{number}" for number in itertools.count(1) if f"point{number}" not in named)
+    free_names = (name for number in itertools.count(1) if (name := f"{unnamed}{number}") not in named)
     first: dict[str, SurveyedPoint] = {}
     marks: dict[str, dict[str, Mark]] = {}
     for row in rows:
@@ -230,7 +233,7 @@ def _points(rows: list[_Row]) -> tuple[SurveyedPoint, ...]:
             )
         marks[name][mark.image] = mark
     return tuple(
-        SurveyedPoint(**{**vars(point), "name": name, "marks": tuple(marks[name].values())})
+        dataclasses.replace(point, name=name, marks=tuple(marks[name].values()), is_named=name in named)
         for name, point in first.items()
     )
 

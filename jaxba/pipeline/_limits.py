@@ -42,12 +42,13 @@ def check_store(store: Path, num_photos: int, detector: str, params: Params, res
     place = next(folder for folder in (store, *store.absolute().parents) if folder.exists())
     free = float(shutil.disk_usage(place).free)
     used = sum(path.stat().st_size for path in store.rglob("*") if path.is_file())
-    allowed = bytes_of(resources.max_store, free + used)
+    allowed = min(bytes_of(resources.max_store, free + used), free + used)
     if need > allowed:
         raise JaxbaError(
-            f"the features of {num_photos:,} photos take up to {_size(need)} on the disk, at {nfeatures:,} "
-            f"keypoints a photo; --max-store {resources.max_store} allows {_size(allowed)}, {_size(free)} are free. "
-            "Set fewer features.nfeatures, take fewer photos, raise --max-store, or choose an --out on a larger disk."
+            f"the features of {num_photos:,} photos take up to {size_text(need)} on the disk, at {nfeatures:,} "
+            f"keypoints a photo; --max-store {resources.max_store} allows {size_text(allowed)}, {size_text(free)} are "
+            "free. Set fewer features.nfeatures, take fewer photos, raise --max-store, or choose an --out on a larger "
+            "disk."
         )
 
 
@@ -76,6 +77,11 @@ def _reasons(failed: Sequence[Left]) -> str:
     return "; ".join(texts) + (f"; and {rest} other reasons" if rest > 0 else "")
 
 
-def _size(count: float) -> str:
+def size_text(count: float) -> str:
+    """Return bytes in words.
+
+    >>> size_text(150e6)
+    '150.0 MB'
+    """
     unit, name = next(((u, n) for u, n in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if count >= u), (1e3, "kB"))
     return f"{count / unit:.1f} {name}"

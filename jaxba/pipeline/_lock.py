@@ -9,6 +9,7 @@ import datetime
 import os
 import socket
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -17,6 +18,7 @@ from jaxba._errors import JaxbaError
 from jaxba.pipeline._store import cannot_write
 
 _NAME = ".lock"
+_TRIES, _PAUSE_S = 5, 0.02
 
 
 @contextlib.contextmanager
@@ -28,7 +30,7 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise cannot_write(path, error) from error
     with open(path, "r+", encoding="utf-8") as file:
-        if not _take(file):
+        if not _take_soon(file):
             raise JaxbaError(
                 f"{folder}: another run works on it ({_said(path)}); wait until it has ended, or choose another --out."
             )
@@ -54,6 +56,15 @@ def _said(path: Path) -> str:
         return path.read_text(encoding="utf-8").strip() or "it has just begun"
     except OSError:  # Windows lets nobody read a locked file
         return "its process cannot be told"
+
+
+def _take_soon(file: IO[str]) -> bool:
+    """Lock a file that `holder` may hold for an instant."""
+    for _ in range(_TRIES):
+        if _take(file):
+            return True
+        time.sleep(_PAUSE_S)
+    return False
 
 
 def _take(file: IO[str]) -> bool:

@@ -8,6 +8,7 @@ from jaxba.pipeline._lock import holder
 from jaxba.pipeline._project import SETTINGS, SUMMARY, Project, read_lists
 from jaxba.pipeline._settings import default_settings, from_toml
 from jaxba.pipeline._stages import STAGES, Done
+from jaxba.pipeline._summary import left_out_by_last_run
 from jaxba.pipeline._work import collected, works
 from jaxba.scene import Left
 
@@ -64,10 +65,11 @@ def recorded(folder: Path) -> Recorded:
             break
         outputs, failed[stage.name] = collected(stage, done, items)
         setattr(done, stage.name, outputs)
-    for entry in ended.get("left_out", ()):  # a worker that died leaves no record
-        others = failed.get(entry["stage"], ())
-        if entry["stage"] in ("features", "match") and entry["name"] not in {left.name for left in others}:
-            failed[entry["stage"]] = (*others, Left(name=entry["name"], reason=entry["reason"]))
+    for name in ("features", "match"):
+        known = {left.name for left in failed.get(name, ())}
+        others = [left for left in left_out_by_last_run(ended, name) if left.name not in known]
+        if others:
+            failed[name] = (*failed.get(name, ()), *others)
     return Recorded(
         done=done,
         stopped=Left(name=stopped["stage"], reason=stopped["reason"]) if isinstance(stopped, dict) else None,

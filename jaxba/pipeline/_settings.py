@@ -9,6 +9,7 @@ A section or a name that does not exist, and a value out of its range, are error
 word for nothing: a parameter that may be `none` takes the text "none".
 """
 
+import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, fields, replace
@@ -100,7 +101,8 @@ def _explained(field: Field) -> str:
 
 def _toml_value(value: Any) -> str:
     if value is None or isinstance(value, str):
-        return '"' + ("none" if value is None else value).replace("\\", "\\\\").replace('"', '\\"') + '"'
+        # JSON's escapes are TOML's but for DEL
+        return json.dumps("none" if value is None else value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return plain(value) if isinstance(value, bool) else repr(value)
 
 

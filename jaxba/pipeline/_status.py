@@ -13,19 +13,21 @@ from jaxba.pipeline._lock import holder
 from jaxba.pipeline._project import SETTINGS, SUMMARY, Given, Project, read_lists
 from jaxba.pipeline._settings import Settings, default_settings, from_toml
 from jaxba.pipeline._stages import STAGES, Done, Stage
-from jaxba.pipeline._summary import left_out
+from jaxba.pipeline._summary import left_out, left_out_by_last_run
 from jaxba.pipeline._work import collected, why_to_do, works
 from jaxba.scene import EdgeStatus, Left
 
 State = Literal["done", "stale", "partly done", "not done", "waits"]
 _REASONS = 3
+_NOT_DONE = "not done yet"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
     """How a stage stands.
 
-    - `num_done`, `num_all`: works done and current, and all of them: one, or one a photo; 0 where it waits.
+    - `num_done`, `num_all`: works done and current, and all of them: one, or one a photo; 0 where it waits. Photos
+      whose worker died in the last run are not done, and do not hold the stage up: the next run tries them again.
     - `reason`: why it is not done, in words; empty where it is.
     """
 
@@ -69,6 +71,7 @@ def status(folder: Path, settings: Settings) -> Status:
     given, stage_now = project.read_given()
     done: Done | None = None
     stages: list[Standing] = []
+    summary = project.read_json(SUMMARY) if stage_now is None else None  # else of the run before
     try:
         files = project.photo_files(given.photos, remember=False)
         done = Done(files=files, settings=settings, **read_lists(given))
@@ -79,7 +82,8 @@ def status(folder: Path, settings: Settings) -> Status:
             stages.append(_waiting(project, stage, stages))
             continue
         assert done is not None
-        stages.append(_standing(project, stage, done, settings))
+        died = left_out_by_last_run(summary, stage.name) if stage.collect is not None else ()
+        stages.append(_standing(project, stage, done, settings, died))
     return Status(
         stages=tuple(stages),
         left_out=() if done is None else tuple((s, left) for s, found in left_out(done).items() for left in found),
@@ -88,19 +92,24 @@ def status(folder: Path, settings: Settings) -> Status:
     )
 
 
-def _standing(project: Project, stage: Stage, done: Done, settings: Settings) -> Standing:
-    """Return how a stage stands, and note in `done` what it made where it is done."""
+def _standing(project: Project, stage: Stage, done: Done, settings: Settings, died: Sequence[Left]) -> Standing:
+    """Return how a stage stands, and note in `done` what it made where it is done.
+
+    - `died`: photos that the last run could not use in it; of those without a record the worker died.
+    """
     params = settings[stage.name]
     items = works(project, stage, done, params)
-    reasons = [reason for item in items if (reason := why_to_do(project, stage, item, params))]
-    count = len(items) - len(reasons)
+    why = {item.photo: reason for item in items if (reason := why_to_do(project, stage, item, params))}
+    lost = tuple(left for left in died if why.get(left.name) == _NOT_DONE)
+    reasons = [reason for name, reason in why.items() if name not in {left.name for left in lost}]
+    count = len(items) - len(why)
     if not reasons:
         outputs, unused = collected(stage, done, items)
         setattr(done, stage.name, outputs)
         if stage.collect is not None:
-            setattr(done, f"{stage.name}_left_out", (*unused, *stage.useless(done, outputs)))
+            setattr(done, f"{stage.name}_left_out", (*unused, *lost, *stage.useless(done, outputs)))
         return Standing(stage=stage.name, state="done", num_done=count, num_all=len(items))
-    fresh = all(reason == "not done yet" for reason in reasons)
+    fresh = all(reason == _NOT_DONE for reason in reasons)
     state: State = "stale" if not fresh else "partly done" if count else "not done"
     return Standing(stage=stage.name, state=state, num_done=count, num_all=len(items), reason=_grouped(reasons))
 

@@ -97,7 +97,10 @@ def load(folder: Path, cls: type[T]) -> T:
     content = _content(folder)
     if content is None:
         raise JaxbaError(f"{folder}: the record is missing or damaged; run again to make it anew.")
-    return _converter().structure(_files_to_arrays(content["value"], folder), cls)
+    try:
+        return _converter().structure(_files_to_arrays(content["value"], folder), cls)
+    except cattrs.BaseValidationError as error:
+        raise JaxbaError(f"{folder}: the record is of another version of jaxba; run again to make it anew.") from error
 
 
 class Stored(Mapping[int, T]):

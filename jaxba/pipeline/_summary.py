@@ -144,6 +144,15 @@ def _features(found: Detected, names: Sequence[str]) -> dict[str, Any]:
     return {"routing": routing, "photos": {names[i]: asdict(found.tunings[i]) for i in sorted(found)}}
 
 
+def left_out_by_last_run(facts: object, stage: str) -> tuple[Left, ...]:
+    """Return what a run's summary says a stage could not use: also photos whose worker died, which leave no record.
+
+    - `facts`: of `summary.json`; anything else says nothing.
+    """
+    entries = facts.get("left_out", ()) if isinstance(facts, dict) else ()
+    return tuple(Left(name=entry["name"], reason=entry["reason"]) for entry in entries if entry["stage"] == stage)
+
+
 def left_out(done: Done) -> dict[str, tuple[Left, ...]]:
     """Return the files that are not in the result, and photos that could not be matched, by stage.
 

@@ -20,6 +20,7 @@ from jaxba.pipeline._marks import marks_in_photos
 from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.scene import Control, Left, LocalFrame, Photo, Reference
 
+_PLACE = ("crs", "x", "y", "z_m")
 _LEAST_FIT = {"helmert": 3, "affine": 4}  # control points that are marked twice
 
 
@@ -148,11 +149,15 @@ def _all_points(inputs: Inputs, params: Params) -> tuple[list[SurveyedPoint], li
     for entry, is_check in ((inputs.gcp, False), (inputs.check, True)):
         if entry is None:
             continue
-        read: ControlList = parse_control(entry[1], entry[0])
+        read: ControlList = parse_control(entry[1], entry[0], "check" if is_check else "point")
         notes += read.notes
         for point in read.points:
-            joined = _joined(found[point.name], point) if point.name in found else point
-            found[point.name] = dataclasses.replace(joined, is_check=joined.is_check or is_check)
+            same = found.get(point.name) if point.is_named else None
+            same = same or next((other for other in found.values() if _is_one_unnamed(other, point)), None)
+            joined = point if same is None else _joined(same, point)
+            while same is None and joined.name in found:  # a number that is a name in the other list
+                joined = dataclasses.replace(joined, name=f"{joined.name}_")
+            found[joined.name] = dataclasses.replace(joined, is_check=joined.is_check or is_check)
     asked = [name for name in (text.strip() for text in (params.check or "").replace(";", ",").split(",")) if name]
     unknown = [name for name in asked if name not in found]
     if unknown:
@@ -164,9 +169,16 @@ def _all_points(inputs: Inputs, params: Params) -> tuple[list[SurveyedPoint], li
     ], notes
 
 
+def _is_one_unnamed(first: SurveyedPoint, second: SurveyedPoint) -> bool:
+    """Whether two lists mean one point by its place, which one of them does not name."""
+    if first.is_named and second.is_named:
+        return False
+    return all(getattr(first, field) == getattr(second, field) for field in _PLACE)
+
+
 def _joined(first: SurveyedPoint, second: SurveyedPoint) -> SurveyedPoint:
     """Return a point of both lists: one place, the marks of both, the same mark once."""
-    for field in ("crs", "x", "y", "z_m"):
+    for field in _PLACE:
         if getattr(first, field) != getattr(second, field):
             raise JaxbaError(
                 f"{second.source}: {second.name} has {field} {getattr(second, field)}, and {getattr(first, field)} in "

@@ -75,7 +75,7 @@ def test_points_lie_where_they_were_surveyed():
 
 def test_check_points_come_from_a_list_a_role_or_a_parameter():
     names = lambda made: [name for name, is_check in zip(made.control.names, made.control.is_check) if is_check]  # noqa: E731, B905
-    assert names(run(check="gcp1; gcp3".replace(";", ",") and gcp_list())) == ["gcp0", "gcp1", "gcp2", "gcp3"]
+    assert names(run(check=gcp_list())) == ["gcp0", "gcp1", "gcp2", "gcp3"]
     lines = gcp_list().splitlines()
     only_first = "\n".join(lines[:5])
     both = run(check=only_first)  # the name stands in both lists, with the same marks
@@ -210,3 +210,15 @@ def test_real_marks_in_original_pixels_are_noticed(data_dir: Path):
                    gcp=("gcp_list.txt", text)),
             Params(),
         )  # fmt: skip
+
+
+def test_points_without_names_keep_apart_in_two_lists_and_one_place_is_one_point():
+    def unnamed(text: str) -> str:
+        return "\n".join(line.rsplit(" ", 1)[0] if " " in line else line for line in text.splitlines())
+
+    made = run(unnamed(gcp_list()), check=unnamed(gcp_list(dx=7.0))).control
+    assert made.names == tuple(f"{kind}{k}" for kind in ("point", "check") for k in range(1, 5))
+    assert made.is_check.tolist() == [False] * 4 + [True] * 4
+    lines = gcp_list().splitlines()
+    both = run(unnamed(gcp_list()), check="\n".join(lines[:5])).control  # the first of them has a name there
+    assert both.is_check.tolist() == [True, False, False, False] and len(both.mark_point) == 16

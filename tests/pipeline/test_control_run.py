@@ -12,6 +12,7 @@ from jaxba.io import read_tile
 from jaxba.pipeline import summary
 from jaxba.pipeline._control_summary import control_rows
 from jaxba.pipeline._events import Run
+from jaxba.pipeline.verification import Params, verify
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +73,19 @@ def test_tile_holds_the_control_points_with_their_marks(run: Run, survey: Survey
     adjusted = run.done.adjust.control.adjusted_m[~run.done.control.control.is_check]
     # the tile starts at the marks' intersection, the adjusted points are held by the survey too
     np.testing.assert_allclose(np.asarray(problem.points)[block.num_points :], adjusted, atol=0.1)
+
+
+def test_verification_passes_with_control_in_the_adjustment_and_fitted_afterwards(
+    run: Run, survey: Survey, tmp_path: Path
+) -> None:
+    def failed(of: Survey) -> list[str]:
+        return [check.text for check in verify(of.project, Params()) if check.state == "FAIL"]
+
+    assert failed(survey) == []
+    lists = survey.photos.parent
+    fitted = survey.copy(tmp_path)
+    fitted.run("control.method=affine", gcp=lists / "gcp_list.txt", check=lists / "check_list.txt")
+    assert failed(fitted) == []
 
 
 def test_a_list_that_is_not_there_is_named(survey: Survey, tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_groups_are_named_with_the_pairs_that_would_join_them(made: Survey, tmp_
     diagnosis = found(survey, until="tracks")["several groups"]
     groups = [set(group) for group in diagnosis.figures["groups"]]
     names = [path.name for path in photos_of(survey)]
-    assert {frozenset(group & set(names[:4])) for group in groups} - {frozenset()}
+    assert set().union(*groups) == set(names) and diagnosis.figures["joining"]
     assert not any(group & set(names[:4]) and group & set(names[4:]) for group in groups)
     for pair in diagnosis.figures["joining"]:
         assert pair in diagnosis.cure
@@ -182,6 +182,16 @@ def test_control_of_another_datum_with_a_blunder(made: Survey, tmp_path: Path):
     assert "gcp02" in result["poor control"].figures["suspects"] and "not the solver" in result["poor control"].cause
 
 
+def test_control_hundreds_of_metres_off(made: Survey, tmp_path: Path):
+    crs, *marks = (made.photos.parent / "gcp_list.txt").read_text().splitlines()
+    rows = [mark.split() for mark in marks]
+    moved = [" ".join([f"{float(row[0]) + 300:.4f}", *row[1:]]) for row in rows]
+    (tmp_path / "gcp_list.txt").write_text("\n".join([crs, *moved, ""]))
+    result = found(made.copy(tmp_path), "adjust.max_rounds=1", until="adjust", gcp=tmp_path / "gcp_list.txt")
+    assert result["far off"].figures["gnss_minus_control_m"][0] == pytest.approx(-300, abs=1)
+    assert "control in another zone, or with swapped axes" in result["far off"].cause
+
+
 def test_altitudes_that_climb_in_one_flight(tmp_path: Path):
     folder, pixels = tmp_path / "photos", np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
     folder.mkdir()
@@ -206,7 +216,7 @@ def test_photos_over_the_memory_limit(made: Survey, tmp_path: Path):
         run_pipeline(made.photos, tmp_path / "project", settings, until="features")
     result = {diagnosis.name: diagnosis for diagnosis in diagnose(tmp_path / "project")}
     assert len(result["out of memory"].figures["photos"]) == NUM_PHOTOS
-    assert "workers.max_memory=150MB allows 0.1 GB" in result["out of memory"].cause
+    assert "workers.max_memory=150MB allows 150.0 MB" in result["out of memory"].cause
     assert result["stopped"].figures["stage"] == "features"
 
 
@@ -215,7 +225,7 @@ def test_features_over_the_store_limit(made: Survey, tmp_path: Path):
     with pytest.raises(JaxbaError):
         run_pipeline(made.photos, tmp_path / "project", settings, until="features")
     result = {diagnosis.name: diagnosis for diagnosis in diagnose(tmp_path / "project")}
-    assert "workers.max_store=1MB allows 0.00 GB" in result["out of disk"].cause
+    assert "workers.max_store=1MB allows 1.0 MB" in result["out of disk"].cause
 
 
 @pytest.mark.parametrize("stage", ["features", "start"])

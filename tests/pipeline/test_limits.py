@@ -111,6 +111,8 @@ def test_what_is_stored_already_counts_as_free(tmp_path: Path, monkeypatch: pyte
     params = features.Params(nfeatures=2000)
     with pytest.raises(JaxbaError, match=r"up to 4\.\d MB .* --max-store 0.9 allows 900.0 kB, 1.0 MB are free"):
         check_store(tmp_path, 10, "sift", params, Resources())
+    with pytest.raises(JaxbaError, match=r"--max-store 1GB allows 1.0 MB, 1.0 MB are free"):
+        check_store(tmp_path, 10, "sift", params, Resources(max_store="1GB"))
     (tmp_path / "SIM_0001.JPG").mkdir()
     (tmp_path / "SIM_0001.JPG" / "features.descriptors.npy").write_bytes(bytes(4_000_000))
     check_store(tmp_path, 10, "sift", params, Resources())

@@ -2,12 +2,13 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
 from jaxba import JaxbaError
-from jaxba.pipeline._lock import holder, locked
+from jaxba.pipeline._lock import _take, holder, locked
 
 HOLD = """
 import sys, time
@@ -35,6 +36,16 @@ def test_two_runs_refuse_each_other_and_the_message_names_the_one_that_goes_on(o
     ):
         pass
     assert f"process {other.pid} on" in str(holder(tmp_path))
+
+
+def test_a_look_at_the_holder_does_not_refuse_a_run(tmp_path: Path):
+    with locked(tmp_path):
+        pass
+    with open(tmp_path / ".lock", "r+") as looks:
+        assert _take(looks)
+        threading.Timer(0.03, looks.close).start()
+        with locked(tmp_path):
+            assert holder(tmp_path) is not None
 
 
 def test_a_killed_run_locks_nobody_out(other, tmp_path: Path):

@@ -80,7 +80,9 @@ def test_allowed_says_ranges_in_words():
 
 
 def test_a_toml_of_all_settings_reads_back_as_they_were(tmp_path):
-    settings = changed(default_settings(), ["match.ratio=0.7", 'crs.target_crs=a "b" \\ c', "adjust.ftol=1e-9"])
+    settings = changed(
+        default_settings(), ["match.ratio=0.7", 'crs.target_crs=a "b" \\ c\n\td\x7f', "adjust.ftol=1e-9"]
+    )
     for explain in (False, True):
         (tmp_path / "jaxba.toml").write_text(to_toml(settings, explain=explain))
         assert from_toml(tmp_path / "jaxba.toml", default_settings()) == settings

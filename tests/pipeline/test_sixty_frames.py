@@ -17,8 +17,9 @@ import pytest
 from PIL import Image
 from small_survey import repaint
 
-from jaxba.pipeline import Resources
+from jaxba.pipeline import Resources, project_settings, status
 from jaxba.pipeline._workers import memory_for
+from jaxba.pipeline.diagnosis import diagnose
 from jaxba.pipeline.simulate import Params, write_survey
 
 TRUNCATED, BLACK, CRASHES, HANGS, LARGE = (f"SIM_{i:04d}.JPG" for i in (14, 26, 38, 3, 50))
@@ -114,6 +115,17 @@ def test_the_five_others_are_named_with_the_reason(survey: Path, first: Ended):
     assert all(words in reasons[name] for name, words in expected.items()), reasons
     failed = {event["name"]: event["reason"] for event in first.of_kind("item_failed")}
     assert failed == {name: reasons[name] for name in expected if name != BLACK}  # it was decoded, and is empty
+
+
+@pytest.mark.slow
+def test_status_and_diagnosis_name_them_too(survey: Path, first: Ended):
+    found = status(survey / "project", project_settings(survey / "project"))
+    assert found.is_done and {left.name for _, left in found.left_out} == {TRUNCATED, BLACK, CRASHES, HANGS, LARGE}
+    stage = next(stage for stage in found.stages if stage.stage == "features")
+    assert (stage.num_done, stage.num_all) == (57, 60)  # three without a record
+    causes = {diagnosis.name: diagnosis for diagnosis in diagnose(survey / "project")}
+    assert causes["out of memory"].figures["photos"] == [LARGE] and causes["crash"].figures["photos"] == [CRASHES]
+    assert "SIGSEGV" in causes["crash"].cause and "--max-memory" in causes["out of memory"].cure
 
 
 @pytest.mark.slow

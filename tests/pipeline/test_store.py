@@ -146,3 +146,14 @@ def test_a_stored_mapping_opens_what_is_looked_at(tmp_path, made):
     assert list(only) == [0] and only[0].tolist() == [0, 1, 2, 3, 4]
     with pytest.raises(JaxbaError, match=r"index\.npy"):
         _ = stored[5]
+
+
+def test_a_record_of_another_version_is_said(made, tmp_path):
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Newer:
+        points: Float[np.ndarray, "points 3"]
+        since: int
+
+    save(tmp_path / "made", made, ONE)
+    with pytest.raises(JaxbaError, match=r"made: the record is of another version of jaxba; run again"):
+        load(tmp_path / "made", Newer)

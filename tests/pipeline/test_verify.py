@@ -64,6 +64,18 @@ def test_a_nan_in_the_cloud(export: Path):
     assert "Y of point 17 is nan (1 of" in found["numbers cloud.csv"] and "run again" in found["numbers cloud.csv"]
 
 
+def test_a_binary_model_that_is_cut_off(export: Path):
+    path = export / "colmap" / "binary" / "points3D.bin"
+    path.write_bytes(path.read_bytes()[:200])
+    found = failures(export)
+    assert set(found) == {"files"} and "colmap/binary/points3D.bin changed since they were written" in found["files"]
+
+
+def test_a_damaged_frame_does_not_blame_the_clouds(export: Path):
+    (export / "colmap" / "frame.json").write_text('{"world"')
+    assert set(failures(export)) == {"schema colmap/frame.json"}
+
+
 def test_a_nan_in_colmap(export: Path):
     path = export / "colmap" / "text" / "points3D.txt"
     lines = path.read_text().splitlines()

@@ -36,10 +36,11 @@ def large_median(case: Recorded) -> Diagnosis | None:
     edge_px = float(np.median(graph.residual_px[edges])) if edges.any() else float("nan")
     text = f"{begin}, though pairs alone fit to {edge_px:.2f} px: wrong focal lengths, mixed cameras or corrupt edges. "
     text += f"{cameras} "
-    text += f"Edges left out: {some([left.name for left in pruned], 3)}." if pruned else "No edge was left out."
+    if done.adjust is not None:
+        text += f"Edges left out: {some([left.name for left in pruned], 3)}." if pruned else "No edge was left out."
     return Diagnosis(
         name="large errors",
-        cause=text,
+        cause=text.rstrip(),
         cure="Compare the focal length with the sensor's specification and set metadata.focal, or leave it to the "
         "tags; keep photos of one camera, zoom and size in one folder; look at the photos of the edges named.",
         figures={"median_px": median_px, "edge_median_px": edge_px, "focal_px": focals,

@@ -1,13 +1,16 @@
 """Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
 
-from jaxba.pipeline._limits import num_keypoints, store_bytes
+from jaxba.pipeline._limits import num_keypoints, size_text, store_bytes
 from jaxba.pipeline._recorded import Recorded
 from jaxba.pipeline._words import some
 from jaxba.pipeline._workers import Resources, bytes_of, machine_memory, memory_for
 from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
 from jaxba.pipeline.features import Params
+from jaxba.scene import Left
 
 _BY_PHOTOS = ("features", "match")
+_DIED = "worker process"  # words of `_pool.py`
+_OF_MEMORY = ("needs about", "not enough memory", "SIGKILL", "SIGABRT")
 
 
 def killed(case: Recorded) -> Diagnosis | None:
@@ -47,19 +50,51 @@ def over_memory(case: Recorded) -> Diagnosis | None:
     allowed = resources.memory_bytes
     need = {photo.name: memory_for(photo.megapixels) for photo in case.done.photos}
     over = [name for name, count in need.items() if count > allowed]
-    lost = {left.name: left for name in _BY_PHOTOS for left in case.failed.get(name, ()) if "memory" in left.reason}
-    names = [*over, *(name for name in lost if name not in over)]
+    lost = [left for left in _failed(case) if any(word in left.reason for word in _OF_MEMORY) and left.name not in over]
+    names = [*over, *(left.name for left in lost)]
     if not names:
         return None
     largest = max(need[name] for name in names)
-    why = f", the first: {next(iter(lost.values())).reason.rstrip('.')}" if lost else ""
+    allows = f"workers.max_memory={resources.max_memory} allows {size_text(allowed)}"
+    causes, cures = [], []
+    if over:
+        causes.append(
+            f"{len(over)} of {len(need)} photos do not fit into the memory ({some(over, 3)}): one takes up to "
+            f"{size_text(largest)}, {allows}."
+        )
+        cures.append("Raise --max-memory, or scale the photos down.")
+    if lost:
+        causes.append(
+            f"The workers of {len(lost)} of {len(need)} photos ended as they do without memory ({some(names, 3)}), the "
+            f"first: {lost[0].reason.rstrip('.')}. {allows}."
+        )
+        cures.append("Use fewer --workers, set fewer features.nfeatures, or close other programs.")
     return Diagnosis(
         name="out of memory",
-        cause=f"{len(names)} of {len(need)} photos do not fit into the memory ({some(names, 3)}): one takes up to "
-        f"{largest / 1e9:.1f} GB, workers.max_memory={resources.max_memory} allows {allowed / 1e9:.1f} GB{why}.",
-        cure="Raise --max-memory, use fewer --workers, set fewer features.nfeatures, or scale the photos down.",
+        cause=" ".join(causes),
+        cure=" ".join(cures),
         figures={"photos": names, "need_bytes": largest, "allowed_bytes": allowed},
     )
+
+
+def crashed(case: Recorded) -> Diagnosis | None:
+    """Photos whose worker died of something else than memory: a broken file that crashes the decoder."""
+    lost = [left for left in _failed(case) if _DIED in left.reason and not any(w in left.reason for w in _OF_MEMORY)]
+    if not lost:
+        return None
+    names = [left.name for left in lost]
+    return Diagnosis(
+        name="crash",
+        cause=f"The workers of {len(lost)} photos died ({some(names, 3)}), the first: {lost[0].reason.rstrip('.')}.",
+        cure="Open these photos in another program; copy them anew from the card, or leave them out.",
+        figures={"photos": names},
+    )
+
+
+def _failed(case: Recorded) -> list[Left]:
+    """Return the photos that failed where photos are worked on, each once."""
+    found = {left.name: left for name in _BY_PHOTOS for left in case.failed.get(name, ())}
+    return list(found.values())
 
 
 def over_store(case: Recorded) -> Diagnosis | None:
@@ -75,8 +110,8 @@ def over_store(case: Recorded) -> Diagnosis | None:
         return None
     return Diagnosis(
         name="out of disk",
-        cause=f"Features of {len(case.done.photos):,} photos take up to {need / 1e9:.2f} GB on the disk, "
-        f"workers.max_store={resources.max_store} allows {allowed / 1e9:.2f} GB.",
+        cause=f"Features of {len(case.done.photos):,} photos take up to {size_text(need)} on the disk, "
+        f"workers.max_store={resources.max_store} allows {size_text(allowed)}.",
         cure="Set fewer features.nfeatures, take fewer photos, or raise --max-store.",
         figures={"need_bytes": need, "allowed_bytes": allowed},
     )

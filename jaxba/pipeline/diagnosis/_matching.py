@@ -106,13 +106,14 @@ def several_groups(case: Recorded) -> Diagnosis | None:
     joining = [f"{names[i]}, {names[j]}" for i, j in graph.pairs[between[:_NEAREST]].tolist()]
     if joining:
         most = int(graph.num_putative[between[0]])
-        cause += f" {len(between)} candidate pairs lie between them, with {most} matches before verification at most."
+        cause += f" {len(between)} candidate pairs lie between them, with {most} matches before verification at most: "
+        cause += "too little in common that can be recognised, across water or woods, or after the light has changed."
     else:
         joining, how = _nearest_between(case, groups)
-        cause += f" No candidate pair lies between them{how}."
+        cause += f" No candidate pair lies between them{how}: a missing line, or lines too far apart."
     return Diagnosis(
         name="several groups",
-        cause=f"{cause} There is no overlap across them: a missing line, or lines too far apart.",
+        cause=cause,
         cure=f"Pairs that would join them: {'; '.join(joining)}. Fly photos between these, or set "
         "pairs.method=exhaustive and features.contrast_threshold=0.02 where they do overlap.",
         figures={"groups": [[names[i] for i in group] for group in groups], "joining": joining},

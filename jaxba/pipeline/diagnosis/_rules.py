@@ -23,6 +23,7 @@ RULES: tuple[Rule, ...] = (
     limits.killed,
     limits.out_of_date,
     limits.over_memory,
+    limits.crashed,
     limits.over_store,
     place.far_off,
     place.mixed_datum,

@@ -8,6 +8,7 @@ earth (see `_place.py`).
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from jaxba.pipeline.verification._exported import (
     BINARY,
     CLOUDS,
     DESCRIPTION,
+    FRAME,
     OPENSFM,
     SITES,
     TEXT,
@@ -28,6 +30,9 @@ from jaxba.pipeline.verification._exported import (
     Exported,
     read_export,
 )
+
+if TYPE_CHECKING:
+    from jaxba.ba import Problem
 
 _ROUNDING = 0.002  # units of the CRS: CSV has three decimals, LAZ whole thousandths
 _CURE = "run again to export it anew"
@@ -68,8 +73,16 @@ def verify(folder: Path, params: Params) -> list[Check]:
         _same_points(exported, adjusted),
         _median(exported, params),
         _inliers(adjusted, params),
-        *place_checks(project, exported, np.zeros(3) if adjusted is None else adjusted.gnss_offset_m),
+        *place_checks(project, exported, _moved_m(adjusted)),
     ]
+
+
+def _moved_m(adjusted: adjust.Outputs | None) -> np.ndarray:
+    """Return what control moved the measured positions by: in the adjustment, or the block beside them afterwards."""
+    if adjusted is None:
+        return np.zeros(3)
+    away_m = np.nan_to_num(adjusted.gnss_minus_control_m)
+    return adjusted.gnss_offset_m if adjusted.gnss_offset_m.any() else away_m
 
 
 def _files(folder: Path, written: export.Outputs) -> Check:
@@ -81,6 +94,9 @@ def _files(folder: Path, written: export.Outputs) -> Check:
         return failed("files", f"{', '.join(wrong)}, of {len(written.files)} files; {_CURE}.")
     sums = zip(written.files, written.sha256, strict=True)
     changed = [name for name, checksum in sums if damaged_file(folder, {name: checksum})]
+    unread = [name for name in changed if name.startswith(f"{BINARY}/")]  # of which no more than the head is read
+    if unread:
+        return failed("files", f"{', '.join(unread)} changed since they were written; {_CURE}.")
     since = f"; changed since they were written: {', '.join(changed)}" if changed else ""
     return ok("files", f"{len(written.files)} files, none empty{since}")
 
@@ -99,8 +115,8 @@ def _counts(exported: Exported) -> Iterator[Check]:
     if exported.has(OPENSFM):
         points[OPENSFM], images[OPENSFM] = len(exported[OPENSFM]["points"]), len(exported[OPENSFM]["shots"])
     if exported.has(TILE):
-        tile = exported[TILE]
-        points[TILE], images[TILE], observations[TILE] = tile.num_points, tile.num_images, tile.num_observations
+        images[TILE] = exported[TILE].num_images
+        points[TILE], observations[TILE] = _without_control(exported[TILE])
     for what, counts in (("points", points), ("images", images), ("observations", observations)):
         name = f"counts {what}"
         if len(counts) < 2:
@@ -109,6 +125,16 @@ def _counts(exported: Exported) -> Iterator[Check]:
         texts = ", ".join(f"{file} {count:,}" for file, count in counts.items())
         same = f"{next(iter(counts.values())):,} in each of {len(counts)} files"
         yield judged(name, len(set(counts.values())) == 1, same, f"the files disagree: {texts}; {_CURE}.")
+
+
+def _without_control(tile: "Problem") -> tuple[int, int]:
+    """Return the numbers of tie points and of their observations: a tile holds control points and their marks, too."""
+    from jaxba.ba import ControlPointPrior
+
+    of_control = [np.asarray(prior.point_index) for prior in tile.priors if isinstance(prior, ControlPointPrior)]
+    index = np.concatenate([np.zeros(0, int), *of_control])
+    marks = np.isin(np.asarray(tile.observations.point_index), index)
+    return tile.num_points - len(index), tile.num_observations - int(marks.sum())
 
 
 def _finite(exported: Exported) -> Iterator[Check]:
@@ -168,7 +194,7 @@ def _same_points(exported: Exported, adjusted: adjust.Outputs | None) -> Check:
     """
     name, clouds = "same points", {file: exported[file].cloud for file in CLOUDS if exported.has(file)}
     places = {file: (cloud.point_id, cloud.xyz) for file, cloud in clouds.items()}
-    if exported.has(TEXT) and places:
+    if exported.has(TEXT, FRAME) and places:
         xyz_m = exported[TEXT].block.points_m
         if adjusted is not None and not np.array_equal(adjusted.affine, np.eye(3, 4)):
             xyz_m = xyz_m @ adjusted.affine[:, :3].T + adjusted.affine[:, 3]

@@ -22,6 +22,7 @@ from jaxba.pipeline.diagnosis import RULES, diagnose
 from jaxba.pipeline.diagnosis._adjustment import out_of_steps
 from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
 from jaxba.scene import Attitude
+from jaxba.sfm import _rounds
 from jaxba.vision import PhotoTags, jpeg_with_tags
 
 FOCAL_PX = 540  # of the small survey
@@ -121,6 +122,32 @@ def test_a_wrong_focal_length_is_at_its_bound_with_large_errors(made: Survey, tm
     assert "focal length 1600 px (given), by its tags and sensor 536 px" in result["large errors"].cause
     bound = result["parameter at its bound"]
     assert any(text.endswith(": fx") for text in bound.figures["at_bounds"]) and "allowed 1120 to 2240" in bound.cause
+
+
+def bend(pixels: np.ndarray, noise: np.random.Generator, amount_px: float) -> np.ndarray:
+    """Move the pixels of a photo smoothly, each photo's otherwise."""
+    rows, columns = pixels.shape[:2]
+    coarse = amount_px * noise.normal(size=(2, 4, 5)).astype(np.float32)
+    x, y = (cv2.resize(moved, (columns, rows), interpolation=cv2.INTER_CUBIC) for moved in coarse)
+    x, y = x + np.arange(columns, dtype=np.float32), y + np.arange(rows, dtype=np.float32)[:, None]
+    return cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+
+def test_bent_photos_have_a_large_median_and_more_steps_do_not_help(
+    made: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """They fit in pairs, not together. No survey needs the 100 steps that are the least limit: three stand for them."""
+    full = _rounds.solve
+    monkeypatch.setattr(_rounds, "solve", lambda *a, max_nfev, **named: full(*a, max_nfev=min(max_nfev, 3), **named))
+    survey, noise = made.copy(tmp_path, photos=True), np.random.default_rng(0)
+    for path in photos_of(survey):
+        repaint(path, lambda a: bend(a, noise, 6.0))
+    loose = ("match.ransac_threshold=5", "adjust.track_threshold=4", "adjust.mad_factor=5", "adjust.loss=linear")
+    result = found(survey, *loose, "adjust.max_rounds=1", until="adjust")
+    assert result["large errors"].figures["median_px"] > 3 > 2 * result["large errors"].figures["edge_median_px"]
+    stuck = result["no convergence"]
+    assert stuck.figures["solver"] == "max_nfev" and stuck.figures["median_px"] > 3
+    assert "more steps do not help" in stuck.cause and stuck.figures["inliers_of_a_pair"] > 12
 
 
 def test_a_solver_out_of_steps_with_a_high_cost_speaks_of_bad_input(made: Survey):

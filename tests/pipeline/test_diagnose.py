@@ -136,7 +136,7 @@ def bend(pixels: np.ndarray, noise: np.random.Generator, amount_px: float) -> np
 def test_bent_photos_have_a_large_median_and_more_steps_do_not_help(
     made: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """They fit in pairs, not together. No survey needs the 100 steps that are the least limit: three stand for them."""
+    """They fit in pairs, not together. The least limit, 100 steps, is not reached: three stand for it."""
     full = _rounds.solve
     monkeypatch.setattr(_rounds, "solve", lambda *a, max_nfev, **named: full(*a, max_nfev=min(max_nfev, 3), **named))
     survey, noise = made.copy(tmp_path, photos=True), np.random.default_rng(0)

@@ -21,7 +21,8 @@ from jaxba.pipeline._recorded import recorded
 from jaxba.pipeline.diagnosis import RULES, diagnose
 from jaxba.pipeline.diagnosis._adjustment import out_of_steps
 from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
-from jaxba.scene import Attitude
+from jaxba.pipeline.diagnosis._limits import crashed, over_memory
+from jaxba.scene import Attitude, Left
 from jaxba.sfm import _rounds
 from jaxba.vision import PhotoTags, jpeg_with_tags
 
@@ -245,6 +246,19 @@ def test_photos_over_the_memory_limit(made: Survey, tmp_path: Path):
     assert len(result["out of memory"].figures["photos"]) == NUM_PHOTOS
     assert "workers.max_memory=150MB allows 150.0 MB" in result["out of memory"].cause
     assert result["stopped"].figures["stage"] == "features"
+
+
+def test_workers_that_ended_are_named_by_what_they_died_of(made: Survey):
+    case, died = recorded(made.project), "its worker process was killed by {} twice: out of memory, or a broken file"
+    lost = (
+        Left(name="SIM_0001.JPG", reason=died.format("SIGKILL")),
+        Left(name="SIM_0002.JPG", reason=died.format("SIGSEGV")),
+    )
+    case = dataclasses.replace(case, failed={"features": lost})
+    memory, crash = over_memory(case), crashed(case)
+    assert memory is not None and memory.figures["photos"] == ["SIM_0001.JPG"] and "fewer --workers" in memory.cure
+    assert "1 of 8 photos" in memory.cause and "(SIM_0001.JPG)" in memory.cause and "SIM_0002" not in memory.cause
+    assert crash is not None and crash.figures["photos"] == ["SIM_0002.JPG"] and "SIGSEGV" in crash.cause
 
 
 def test_features_over_the_store_limit(made: Survey, tmp_path: Path):

@@ -65,8 +65,8 @@ def over_memory(case: Recorded) -> Diagnosis | None:
         cures.append("Raise --max-memory, or scale the photos down.")
     if lost:
         causes.append(
-            f"The workers of {len(lost)} of {len(need)} photos ended as they do without memory ({some(names, 3)}), the "
-            f"first: {lost[0].reason.rstrip('.')}. {allows}."
+            f"The workers of {len(lost)} of {len(need)} photos ended as they do without memory "
+            f"({some([left.name for left in lost], 3)}), the first: {lost[0].reason.rstrip('.')}. {allows}."
         )
         cures.append("Use fewer --workers, set fewer features.nfeatures, or close other programs.")
     return Diagnosis(

@@ -36,19 +36,26 @@ def data_dir() -> Path:
     return path
 
 
-_LARGE = {"test_solve", "test_recovery", "test_cli"}  # run real sizes, which optimised code pays for
-# share a survey that one process has run, and hold results to its last bit: code compiled otherwise rounds otherwise
-_LARGE |= {"test_contract", "test_runner", "test_cli_run", "test_bad_input", "test_truth", "test_status"}
-_LARGE |= {"test_killed", "test_verify", "test_diagnose"}
+# run real sizes, which optimised code pays for
+_LARGE = {"test_solve", "test_recovery", "test_cli", "test_cli_run", "test_cli_run_progress", "test_initialise"}
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave out XLA's costly optimisations where dozens of tiny programs are compiled: half the time.
+
+    The pipeline's tests share a run that one process has made, and hold results to its last bit: code that is compiled
+    otherwise rounds otherwise. So a change of this option also forgets the programs of before.
+    """
+    quick = item.path.stem not in _LARGE and item.path.parent.name != "pipeline"
+    if quick != jax.config.read("jax_disable_most_optimizations"):
+        jax.config.update("jax_disable_most_optimizations", quick)
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _quick_compilation(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Leave out XLA's costly optimisations where dozens of tiny programs are compiled: half the time."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", request.path.stem not in _LARGE)
+def _few_programs() -> Iterator[None]:
     yield
-    jax.config.update("jax_disable_most_optimizations", before)
     _unload_programs()
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from surveys import Case, make_case
@@ -13,12 +12,6 @@ from jaxba.scene import Block
 from jaxba.sfm import initialise
 
 ANGLE = np.deg2rad(1.5)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _optimised_code(_quick_compilation: None) -> None:
-    """Real sizes pay for XLA's optimisations, which other tests leave out."""
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def start(case: Case, **changes: object) -> Block:

@@ -115,8 +115,9 @@ def _worked(
     while waiting:
         if broken == _MOST_BROKEN:
             raise JaxbaError(
-                f"worker processes end before they begin ({broken} times in a row); "
-                "raise --max-memory, or use fewer --workers, and see what else takes the machine's memory."
+                f"worker processes end before they begin ({broken} times in a row). In a script, call the pipeline "
+                "under 'if __name__ == \"__main__\":', since workers import it; else raise --max-memory, "
+                "or use fewer --workers, and see what else takes the machine's memory."
             )
         broken += 1
         given: dict[Future, Item] = {}

@@ -45,6 +45,9 @@ def run_pipeline(
     - `out`: the project folder. `settings`: parameters by stage. `geotags`: a list that replaces the photos' tags.
     - `gcp`, `check`: lists of control and of check points.
 
+    Photos are worked on in new processes, which import the script that calls this: it must do so under
+    `if __name__ == "__main__":`.
+
     Raises `JaxbaError` where the photos, the parameters or the folder make a result impossible, and where another run
     works on the project; the stages before it are kept.
     """

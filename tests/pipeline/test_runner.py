@@ -217,6 +217,17 @@ def test_results_are_the_same_bytes_whatever_the_number_of_workers(made: Survey,
     assert list(one) == list(two) and [name for name in one if one[name] != two[name]] == []
 
 
+@pytest.mark.slow
+def test_a_script_that_its_workers_cannot_import_is_told_how_to_be(photos: Path, tmp_path: Path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"from pathlib import Path\nfrom jaxba.pipeline import default_settings, run_pipeline\n"
+        f"run_pipeline(Path({str(photos)!r}), Path({str(tmp_path / 'out')!r}), default_settings(), until='features')\n"
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 1 and "In a script, call the pipeline under 'if __name__ ==" in ended.stderr
+
+
 def test_an_export_folder_that_was_removed_is_written_again(made: Survey, tmp_path: Path):
     survey = made.copy(tmp_path)
     shutil.rmtree(survey.project / "export")

@@ -35,6 +35,7 @@ _MOST_BROKEN = 3  # pools in a row that break before an item ended
 _LOOK_S = 0.5
 _STUCK_S = 180.0  # beyond the time limit: a worker was killed as it held the lock on the others
 _OPENCV_NO_MEMORY = -4
+_TOO_LARGE, _NO_MEMORY, _DIED = "needs about", "not enough memory", "its worker process"  # reasons begin with them
 _DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux
 
 
@@ -71,7 +72,7 @@ def work(
     for item in items:
         if item.need_bytes > resources.memory_bytes:
             need, allowed = _gb(item.need_bytes), _gb(resources.memory_bytes)
-            yield item, None, f"needs about {need} of memory, {allowed} are allowed; raise --max-memory"
+            yield item, None, f"{_TOO_LARGE} {need} of memory, {allowed} are allowed; raise --max-memory"
     fitting, count, _ = _crew(items, resources)
     again: list[tuple[Item, _Ended]] = []
     for item, ended in _worked(call, fitting, resources, count):
@@ -160,10 +161,21 @@ def _ended(future: Future, seconds: float) -> _Ended:
 
 def _reason(ended: _Ended, how_often: str = "") -> str | None:
     if ended.how == "died":
-        return f"its worker process {ended.reason}{how_often}: out of memory, or a broken file that crashes the decoder"
+        return f"{_DIED} {ended.reason}{how_often}: out of memory, or a broken file that crashes the decoder"
     if ended.how == "memory":
-        return "not enough memory; raise --max-memory, or close other programs"
+        return f"{_NO_MEMORY}; raise --max-memory, or close other programs"
     return ended.reason
+
+
+def lacked_memory(reason: str) -> bool:
+    """Whether an item has no result for want of memory: the system kills, and C++ aborts, where there is none."""
+    killed = reason.startswith(_DIED) and any(name in reason for name in ("SIGKILL", "SIGABRT"))
+    return killed or reason.startswith((_TOO_LARGE, _NO_MEMORY))
+
+
+def crashed(reason: str) -> bool:
+    """Whether an item has no result since its worker died of something else than memory."""
+    return reason.startswith(_DIED) and not lacked_memory(reason)
 
 
 def _signal(number: int) -> str:

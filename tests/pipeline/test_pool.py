@@ -8,7 +8,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from worker_calls import double, double_slowly, hold, killed_once, threads
+from worker_calls import double, double_slowly, hold, killed_once, killed_with_the_lock, threads
 
 from jaxba import JaxbaError
 from jaxba.pipeline import Resources, _pool
@@ -55,6 +55,18 @@ def test_what_goes_wrong_with_an_item_costs_that_item_alone_and_is_named():
 def test_an_item_whose_worker_is_killed_from_outside_is_tried_again(tmp_path: Path):
     todo = [Item(name=str(n), arguments=(tmp_path, n), need_bytes=1e8) for n in range(3)]
     assert outcomes(killed_once, todo, Resources(workers=2)) == {str(n): (2 * n, None) for n in range(3)}
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_as_it_holds_the_lock_on_the_others_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(_pool, "_STUCK_S", 5.0)
+    todo = [Item(name=str(n), arguments=(tmp_path, n), need_bytes=1e8) for n in range(8)]
+    begun = time.monotonic()
+    found = outcomes(killed_with_the_lock, todo, Resources(workers=2, time_limit=5.0))
+    assert found == {str(n): (2 * n, None) for n in range(8)} and (tmp_path / "killed").exists()
+    assert time.monotonic() - begun < 45  # the workers themselves wait for the lock for 60 s
 
 
 def test_no_item_is_lost_while_workers_are_killed_again_and_again():

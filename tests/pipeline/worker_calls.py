@@ -1,11 +1,13 @@
 """Functions that tests run in worker processes, which import them by name."""
 
+import gc
 import os
 import signal
 import time
 from pathlib import Path
 
 import numpy as np
+from pebble.pool.channel import WorkerChannel
 
 from jaxba import JaxbaError
 
@@ -44,6 +46,17 @@ def killed_once(marks: Path, number: int) -> int:
     mark = marks / str(number)
     if not mark.exists():
         mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 2 * number
+
+
+def killed_with_the_lock(marks: Path, number: int) -> int:
+    """Double a number; number 3 dies, the first time that it is tried, as it holds the lock that all workers need."""
+    mark = marks / "killed"
+    if number == 3 and not mark.exists():
+        mark.touch()
+        (channel,) = [thing for thing in gc.get_objects() if isinstance(thing, WorkerChannel)]
+        channel.mutex.acquire()
         os.kill(os.getpid(), signal.SIGKILL)
     return 2 * number
 

@@ -1,5 +1,6 @@
 """Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
 
+from jaxba.pipeline import _pool
 from jaxba.pipeline._limits import num_keypoints, size_text, store_bytes
 from jaxba.pipeline._recorded import Recorded
 from jaxba.pipeline._words import some
@@ -9,8 +10,6 @@ from jaxba.pipeline.features import Params
 from jaxba.scene import Left
 
 _BY_PHOTOS = ("features", "match")
-_DIED = "worker process"  # words of `_pool.py`
-_OF_MEMORY = ("needs about", "not enough memory", "SIGKILL", "SIGABRT")
 
 
 def killed(case: Recorded) -> Diagnosis | None:
@@ -50,7 +49,7 @@ def over_memory(case: Recorded) -> Diagnosis | None:
     allowed = resources.memory_bytes
     need = {photo.name: memory_for(photo.megapixels) for photo in case.done.photos}
     over = [name for name, count in need.items() if count > allowed]
-    lost = [left for left in _failed(case) if any(word in left.reason for word in _OF_MEMORY) and left.name not in over]
+    lost = [left for left in _failed(case) if _pool.lacked_memory(left.reason) and left.name not in over]
     names = [*over, *(left.name for left in lost)]
     if not names:
         return None
@@ -79,7 +78,7 @@ def over_memory(case: Recorded) -> Diagnosis | None:
 
 def crashed(case: Recorded) -> Diagnosis | None:
     """Photos whose worker died of something else than memory: a broken file that crashes the decoder."""
-    lost = [left for left in _failed(case) if _DIED in left.reason and not any(w in left.reason for w in _OF_MEMORY)]
+    lost = [left for left in _failed(case) if _pool.crashed(left.reason)]
     if not lost:
         return None
     names = [left.name for left in lost]

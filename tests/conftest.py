@@ -55,8 +55,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_programs() -> Iterator[None]:
+    """Unload programs in time, and let the collector pass over the millions of objects that jax keeps of a module."""
     yield
     _unload_programs()
+    gc.freeze()
 
 
 def _unload_programs() -> None:
@@ -67,5 +69,6 @@ def _unload_programs() -> None:
     """
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+        gc.unfreeze()
         jax.clear_caches()
         gc.collect()

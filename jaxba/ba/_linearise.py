@@ -58,14 +58,24 @@ class Linearisation(eqx.Module):
 
 def cost(system: System, unknowns: Unknowns) -> Float[Array, ""]:
     """Return half the sum of losses; infinite where a point is not in front of a camera or anything is not finite."""
+    return costs(system, unknowns)[0]
+
+
+def costs(system: System, unknowns: Unknowns) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the cost and the plain cost: that without robust losses."""
     residual, depth = system.reprojection.residual(unknowns)
-    total = jnp.sum(system.loss(residual[0] ** 2 + residual[1] ** 2))
+    squared = residual[0] ** 2 + residual[1] ** 2
+    total, plain = jnp.sum(system.loss(squared)), jnp.sum(squared)
     for prior in system.priors:
-        total += jnp.sum(prior.loss(sum_components(prior.residual(unknowns) ** 2)))
-    valid = jnp.isfinite(total)
-    if not system.reprojection.model.sees_behind:
-        valid &= jnp.all(depth > 0)
-    return jnp.where(valid, total / 2, jnp.inf)
+        squared = sum_components(prior.residual(unknowns) ** 2)
+        total += jnp.sum(prior.loss(squared))
+        plain += jnp.sum(squared)
+    in_front = True if system.reprojection.model.sees_behind else jnp.all(depth > 0)
+
+    def valid(total: Array) -> Array:
+        return jnp.where(jnp.isfinite(total) & in_front, total / 2, jnp.inf)
+
+    return valid(total), valid(plain)
 
 
 def point_costs(system: System, unknowns: Unknowns) -> Float[Array, " points"]:

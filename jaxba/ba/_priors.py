@@ -93,12 +93,15 @@ def add_second_derivatives(
         )
         return prior.residual(unknowns.retract(step))
 
+    def first(together: Array) -> tuple[Array, tuple[Array, Array]]:
+        by, value = jax.jacfwd(lambda at: (residual(at),) * 2, has_aux=True)(together)
+        return by, (value, by)
+
     start = jnp.zeros(max(place.stop for place in places.values()), unknowns.points.dtype)
-    value, by = residual(start), jax.jacfwd(residual)(start)
+    second, (value, by) = jax.jacfwd(first, has_aux=True)(start)
     _, slope, bent = prior.loss.derivatives(sum_components(value**2))
-    second = jax.jacfwd(jax.jacfwd(lambda together: jnp.sum(slope * value * residual(together), axis=0)))(start)
     through = jnp.einsum("cn,cni->ni", value, by)
-    hessian = jnp.einsum("n,cni,cnj->nij", slope, by, by) + second
+    hessian = jnp.einsum("n,cni,cnj->nij", slope, by, by) + jnp.einsum("n,cn,cnij->nij", slope, value, second)
     hessian += 2 * bent[:, None, None] * through[:, :, None] * through[:, None]
     masks = {"pose": free.poses, "intrinsics": free.intrinsics, "point": free.points}
     for kind, place in places.items():

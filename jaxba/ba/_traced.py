@@ -5,6 +5,7 @@ ordinary solve, compiled once for both; under `jit` and `vmap` they run in `opti
 jax's default type; derivatives are refused in single precision.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +24,7 @@ from jaxba.ba._check import prepare
 from jaxba.ba._compiled import compiled
 from jaxba.ba._descend import descend
 from jaxba.ba._gauge import require_gauge
-from jaxba.ba._linearise import cost
+from jaxba.ba._linearise import costs
 from jaxba.ba._plan import LinearSolver, Plan, make_plan
 from jaxba.ba._problem import Problem
 from jaxba.ba._rows import Unknowns
@@ -141,9 +142,9 @@ def _result(
     system: System, start: Unknowns, found: Unknowns, problem: Problem, plan: Plan
 ) -> tuple[Unknowns, tuple[Float[Array, ""], ...]]:
     """Return the unknowns in the problem's order, and the cost before and after, with and without losses."""
-    plain = without_losses(system)
-    costs = tuple(cost(of, at) for of in (system, plain) for at in (start, found))
-    return restore(found, problem, plan), costs
+    before_and_after = jax.tree.map(lambda *both: jnp.stack(both), start, found)
+    of_both = jax.vmap(functools.partial(costs, system))(before_and_after)
+    return restore(found, problem, plan), tuple(of_both[plain][end] for plain in (0, 1) for end in (0, 1))
 
 
 @eqx.filter_jit

@@ -81,9 +81,9 @@ def _points_moved(problem: Problem, weights: np.ndarray, **options: object):
 
 @pytest.fixture(scope="module")
 def block() -> Problem:
-    """With the one prior that fixes the gauge: what each prior adds is held to the dense Hessian and differences."""
+    """With two priors, for its programs' size: what each prior adds is held to the dense Hessian and differences."""
     problem = small_problem(SIMPLE, num_outliers=4)
-    return eqx.tree_at(lambda p: p.priors, problem, (problem.prior("position"),))
+    return eqx.tree_at(lambda p: p.priors, problem, (problem.prior("position"), problem.prior("control")))
 
 
 @pytest.fixture(scope="module")

@@ -99,7 +99,9 @@ def test_no_item_is_lost_while_workers_are_killed_again_and_again():
 
 def test_workers_that_end_before_they_begin_stop_the_run(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(_pool, "_prepare_worker", os.abort)
-    with pytest.raises(JaxbaError, match=r"end before they begin \(3 times in a row\); raise --max-memory"):
+    with pytest.raises(
+        JaxbaError, match=r"end before they begin \(3 times in a row\)\. In a script, .*; else raise --max-memory"
+    ):
         list(work(double, items(1, 2), Resources(workers=1)))
 
 

@@ -49,6 +49,8 @@ def test_what_goes_wrong_with_an_item_costs_that_item_alone_and_is_named():
     assert "ended with exit code 3 twice" in reasons["14"]
     assert reasons["15"] == "ValueError: odd" and reasons["18"] == "Awkward: odd" and reasons["19"] == "SystemExit: 4"
     assert "SIGSEGV" in reasons["20"]
+    assert {name for name, reason in reasons.items() if reason and _pool.lacked_memory(reason)} == {"13"}
+    assert {name for name, reason in reasons.items() if reason and _pool.crashed(reason)} == {"14", "20"}
     assert reasons["21"] == "took longer than 2 s; raise --time-limit, or look at the file"
 
 

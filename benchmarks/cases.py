@@ -7,7 +7,7 @@ from pathlib import Path
 from jaxba.ba import Problem
 from jaxba.geometry import AbstractLoss, Huber, Linear
 from jaxba.io import read_bal
-from jaxba.scene import uav_block
+from jaxba.simulation import uav_block
 
 BAL_FOLDER = Path(__file__).parents[2] / "shared" / "data" / "bal"
 _BAL_FILES = {"bal21": "problem-21-11315-pre.txt", "bal49": "problem-49-7776-pre.txt"}

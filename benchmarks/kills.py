@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 from jaxba.pipeline import NAMES
-from jaxba.pipeline.simulate import Params, write_survey
+from jaxba.simulation.photos import Params, write_survey
 
 _POLL_S = 0.001
 _RESULT = Path(__file__).parent / "results" / "kills.json"

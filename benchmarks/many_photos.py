@@ -15,11 +15,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from jaxba.pipeline import Resources, default_settings, features, match
-from jaxba.pipeline._key import Key
-from jaxba.pipeline._pool import Item, work
+from jaxba.engine import Resources
+from jaxba.engine._key import Key
+from jaxba.engine._pool import Item, work
+from jaxba.engine._store import Stored, load, save
+from jaxba.pipeline import default_settings, features, match
 from jaxba.pipeline._stages import run_photo
-from jaxba.pipeline._store import Stored, load, save
 from jaxba.scene import Features, Photo, Reference
 
 WIDTH_PX, HEIGHT_PX, KEYPOINTS = 4000, 3000, 8000

@@ -31,12 +31,12 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from jaxba.engine._store import load
 from jaxba.geo import geodetic_from_local, local_from_geodetic, local_from_projected
 from jaxba.geometry import CAMERAS, Pose, triangulate
 from jaxba.pipeline import adjust, crs, metadata
-from jaxba.pipeline._simulated import survey_frame
-from jaxba.pipeline._store import load
 from jaxba.scene import Block, LocalFrame
+from jaxba.simulation._survey import survey_frame
 
 ROOT = Path(__file__).parents[1]
 _MARK_STD_PX, _NEAR, _LEAST_VIEWS = 0.3, 20, 4

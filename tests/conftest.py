@@ -5,14 +5,21 @@ What one process of a session has compiled, the others and the commands that tes
 
 import gc
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jax
 import jaxtyping
 import pytest
 
+if TYPE_CHECKING:
+    from small_survey import Survey
+
+# what tests share is imported by name, by them and by the workers that they start
+sys.path += [str(folder) for folder in (Path(__file__).parent, *sorted(Path(__file__).parent.glob("[a-z]*/")))]
 jax.config.update("jax_enable_x64", True)
 _cache: tempfile.TemporaryDirectory[str] | None = None  # lasts as long as the session's first process
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -34,6 +41,22 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"needs real data, and {path} is no folder; set JAXBA_DATA to it")
     return path
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photos of a small simulated survey; not to be changed."""
+    from small_survey import make_photos, once, shared_folder
+
+    return once(shared_folder(tmp_path_factory), "survey", make_photos) / "photos"
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory, photos: Path) -> "Survey":
+    """One whole run on them; not to be changed."""
+    from small_survey import Survey, make_project, once, shared_folder
+
+    return Survey(photos, once(shared_folder(tmp_path_factory), "run", make_project(photos)) / "project")
 
 
 # run real sizes, which optimised code pays for

@@ -10,28 +10,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from small_survey import FAST, NUM_PHOTOS, Survey
 
 from jaxba.cli import main
 from jaxba.cli._run import _result_rows
 from jaxba.cli._run_progress import LiveLine
 from jaxba.pipeline import NAMES, Event
 
-sys.path.append(str(Path(__file__).parent / "pipeline"))
-from small_survey import FAST, NUM_PHOTOS, Survey, make_photos, make_project, once, shared_folder
-
 Answer = tuple[int, str, str]
 Cli = Callable[..., Answer]
 FLAGS = [part for change in FAST for part in ("--set", change)]
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return once(shared_folder(tmp_path_factory), "survey", make_photos) / "photos"
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, photos: Path) -> Survey:
-    return Survey(photos, once(shared_folder(tmp_path_factory), "run", make_project(photos)) / "project")
 
 
 @pytest.fixture

@@ -1,3 +1,5 @@
+"""Names that packages load when they are first used: those of their stubs, and nothing heavy before."""
+
 import ast
 import importlib
 import subprocess
@@ -8,40 +10,41 @@ import pytest
 
 import jaxba
 
-SOURCE = Path(jaxba.__file__).read_text()
-NAMES = sorted(jaxba._MODULE_OF)
+STUBS = sorted(Path(jaxba.__file__).parent.rglob("__init__.pyi"))
+NAMES = {
+    stub: [
+        (node.module, alias.name)
+        for node in ast.walk(ast.parse(stub.read_text()))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    ]
+    for stub in STUBS
+}
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_public_name_is_that_of_its_module(name: str):
-    assert getattr(jaxba, name) is getattr(importlib.import_module(jaxba._MODULE_OF[name]), name)
+def _package(stub: Path) -> str:
+    return ".".join(["jaxba", *stub.parent.relative_to(STUBS[0].parent).parts])
 
 
-@pytest.mark.parametrize("name", sorted(jaxba._MODULES))
-def test_public_module_is_the_module(name: str):
-    assert getattr(jaxba, name) is importlib.import_module(jaxba._MODULES[name])
+@pytest.mark.parametrize("stub", STUBS, ids=_package)
+def test_a_name_of_a_stub_is_that_of_its_module(stub: Path):
+    package = importlib.import_module(_package(stub))
+    for module, name in NAMES[stub]:
+        found = getattr(package, name)
+        if module is None:
+            assert found is importlib.import_module(f"{package.__name__}.{name}")
+        else:
+            assert found is getattr(importlib.import_module(f"{package.__name__}.{module}"), name)
 
 
-def test_no_public_name_stands_twice():
-    listed = [name for names in jaxba._NAMES.values() for name in names] + list(jaxba._MODULES)
-    assert sorted(listed) == sorted(set(listed))
-
-
-def test_names_for_type_checkers_are_the_names_at_run_time():
-    block = next(node for node in ast.parse(SOURCE).body if isinstance(node, ast.If))
-    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
-    typed = {(node.module, alias.name, alias.asname) for node in imports for alias in node.names}
-    names = {(module, name, name) for name, module in jaxba._MODULE_OF.items()}
-    modules = {(*target.rsplit(".", 1), public) for public, target in jaxba._MODULES.items()}
-    assert typed == names | modules
-
-
-def test_public_names_are_offered_for_completion():
-    assert set(NAMES) | set(jaxba._MODULES) <= set(dir(jaxba))
+@pytest.mark.parametrize("stub", STUBS, ids=_package)
+def test_names_stand_once_and_are_offered_for_completion(stub: Path):
+    names = [name for _, name in NAMES[stub]]
+    assert sorted(names) == sorted(set(names)) == sorted(dir(importlib.import_module(_package(stub))))
 
 
 def test_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'Hubert'"):
+    with pytest.raises(AttributeError, match="No jaxba attribute Hubert"):
         _ = jaxba.Hubert  # pyright: ignore[reportAttributeAccessIssue]
 
 

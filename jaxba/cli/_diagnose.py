@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from jaxba.cli._text import to_json, wrapped
-from jaxba.pipeline.diagnosis import diagnose
+from jaxba.report.diagnosis import diagnose
 
 _LABEL = 8
 

@@ -16,8 +16,9 @@ from jaxba.cli._main import BAD_INPUT, INTERRUPTED
 from jaxba.cli._options import WorkerOptions
 from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Progress, StageLines, steps_told
 from jaxba.cli._text import first_of, many, to_json, wrapped
-from jaxba.pipeline import Event, Run, changed, run_pipeline, summary
-from jaxba.pipeline._control_summary import control_rows
+from jaxba.pipeline import Event, Run, changed, run_pipeline
+from jaxba.report import summary
+from jaxba.report._control_summary import control_rows
 
 _SUMMARY_LABEL = 12
 

@@ -30,7 +30,8 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 from jaxba.cli._text import many, to_json, wrapped
-from jaxba.pipeline import Event, stage_lines
+from jaxba.pipeline import Event
+from jaxba.report import stage_lines
 
 _CLEAR = "\r\x1b[K"
 LABEL = 10

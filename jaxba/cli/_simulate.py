@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from jaxba.cli._text import many
-from jaxba.pipeline.simulate import Params, write_survey
+from jaxba.simulation.photos import Params, write_survey
 
 
 def run(

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxba.cli._text import to_json, wrapped
-from jaxba.pipeline import Status, changed, from_toml, project_settings, status
+from jaxba.pipeline import changed, from_toml
+from jaxba.report import Status, project_settings, status
 
 _SHOWN = 10
 _LABEL = 10

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxba.cli._text import many
 from jaxba.io import write_tile
-from jaxba.scene.synthetic import Truth, uav_block
+from jaxba.simulation.synthetic import Truth, uav_block
 
 _GNSS_STD_M = (0.03, 0.03, 0.06)
 

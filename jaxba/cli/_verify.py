@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxba.cli._text import many, to_json, wrapped
-from jaxba.pipeline import changed, from_toml, project_settings
-from jaxba.pipeline.verification import Params, verify
+from jaxba.pipeline import changed, from_toml
+from jaxba.report import project_settings
+from jaxba.report.verification import Params, verify
 
 _LABEL = 9
 

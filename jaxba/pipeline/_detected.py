@@ -4,8 +4,8 @@ import functools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from jaxba.engine._store import Stored
 from jaxba.pipeline._routing import Routing
-from jaxba.pipeline._store import Stored
 from jaxba.pipeline._tuning import Tuning
 from jaxba.pipeline.features import Outputs
 from jaxba.scene import Features

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxba._errors import JaxbaError
+from jaxba.engine._workers import Resources, bytes_of
 from jaxba.pipeline._tuning import tune
-from jaxba.pipeline._workers import Resources, bytes_of
 from jaxba.pipeline.features import Params
 from jaxba.scene import Left
 

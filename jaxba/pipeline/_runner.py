@@ -14,18 +14,19 @@ from pathlib import Path
 from typing import Any
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline import _store, features
+from jaxba.engine import _store
+from jaxba.engine._lock import locked
+from jaxba.engine._parameters import Parameters
+from jaxba.engine._pool import Item, fewer_workers, work as work_on
+from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists
+from jaxba.engine._workers import Resources, memory_for
+from jaxba.pipeline import features
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._limits import check_failures, check_store
-from jaxba.pipeline._lock import locked
-from jaxba.pipeline._parameters import Parameters
-from jaxba.pipeline._pool import Item, fewer_workers, work as work_on
-from jaxba.pipeline._project import SETTINGS, SUMMARY, Given, Project, read_lists
 from jaxba.pipeline._settings import Settings, to_toml
 from jaxba.pipeline._stages import NAMES, STAGES, Done, Stage, run_photo
-from jaxba.pipeline._summary import left_out, stage_lines, summary
 from jaxba.pipeline._work import Work, collected, failures, why_to_do, without_path, works
-from jaxba.pipeline._workers import Resources, memory_for
+from jaxba.report._summary import left_out, stage_lines, summary
 from jaxba.scene import Left
 
 

@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline import verification
-from jaxba.pipeline._key import plain
-from jaxba.pipeline._parameters import Parameters, allowed, taken
+from jaxba.engine._key import plain
+from jaxba.engine._parameters import Parameters, allowed, taken
+from jaxba.engine._workers import Resources
 from jaxba.pipeline._stages import STAGES
 from jaxba.pipeline._tiles import Tiles
-from jaxba.pipeline._workers import Resources
+from jaxba.report import verification
 
 Settings = Mapping[str, Parameters]
 """Parameters by section."""

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from jaxba.engine._key import Key
+from jaxba.engine._store import load
 from jaxba.pipeline import adjust, control, crs, export, features, match, metadata, pairs, start, tracks
 from jaxba.pipeline._detected import Detected
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
-from jaxba.pipeline._key import Key
 from jaxba.pipeline._pair_record import PairRecord
 from jaxba.pipeline._routing import Routing, route
-from jaxba.pipeline._store import load
 from jaxba.scene import Left, PhotoFile, Reference, ViewGraph
 
 
@@ -281,7 +281,7 @@ NAMES = tuple(stage.name for stage in STAGES)
 def run_photo(module: str, folder: Any, inputs: Any, params: Any, key: Key) -> str | None:
     """Run a stage for one photo in a worker and save what it makes; return why it could not, or None."""
     from jaxba._errors import JaxbaError
-    from jaxba.pipeline._store import save, save_failure
+    from jaxba.engine._store import save, save_failure
 
     stage = importlib.import_module(module)
     try:

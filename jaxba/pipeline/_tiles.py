@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.engine._parameters import Parameters, parameter
 
 _NOT_YET = "no effect yet, blocks are solved whole, and another value is refused; "
 

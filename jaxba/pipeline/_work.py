@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jaxba.pipeline import _store
-from jaxba.pipeline._key import Key, by_field, what_changed
-from jaxba.pipeline._parameters import Parameters
-from jaxba.pipeline._project import Project
+from jaxba.engine import _store
+from jaxba.engine._key import Key, by_field, what_changed
+from jaxba.engine._parameters import Parameters
+from jaxba.engine._project import Project
 from jaxba.pipeline._stages import Done, Stage
 from jaxba.scene import Left
 

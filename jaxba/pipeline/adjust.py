@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.engine._parameters import Parameters, parameter
 from jaxba.scene import Block, Control, ControlFit, Features, Left, Photo, Reference, Tracks, ViewGraph
 
 

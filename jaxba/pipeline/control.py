@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxba._errors import JaxbaError
+from jaxba.engine._parameters import Parameters, parameter
 from jaxba.io import ControlList, SurveyedPoint, parse_control
 from jaxba.pipeline._marks import marks_in_photos
-from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.scene import Control, Left, LocalFrame, Photo, Reference
 
 _PLACE = ("crs", "x", "y", "z_m")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.engine._parameters import Parameters, parameter
 from jaxba.scene import Left, Photo, Reference
 
 

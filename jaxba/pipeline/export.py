@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxba.engine._parameters import Parameters
+from jaxba.engine._store import sha256
 from jaxba.pipeline import adjust
-from jaxba.pipeline._parameters import Parameters
-from jaxba.pipeline._store import sha256
 from jaxba.scene import Block, Control, LocalFrame, Photo, Reference
 
 

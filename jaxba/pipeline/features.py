@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.engine._parameters import Parameters, parameter
 from jaxba.pipeline._tuning import CONDITIONS, Tuning, tune
 from jaxba.scene import Features, Photo
 from jaxba.vision import OrbOptions, Pixels, decode, detect_features, measure_image

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxba.engine._parameters import Parameters, parameter
 from jaxba.pipeline._fallback import FallbackKeypoints, detect_fallback
 from jaxba.pipeline._pair_record import Fallback, Missed, Model, PairRecord
-from jaxba.pipeline._parameters import Parameters, parameter
 from jaxba.scene import EdgeStatus, Features, Photo, Reference, ViewGraph
 from jaxba.vision import (
     Descriptors,

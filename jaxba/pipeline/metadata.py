@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from jaxba._errors import JaxbaError
+from jaxba.engine._parameters import Parameters, parameter
+from jaxba.engine._words import some_photos
 from jaxba.io import Geotag, match_geotags, parse_geotags
-from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.pipeline._words import some_photos
 from jaxba.scene import Attitude, Left, Photo, PhotoFile
 from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._parameters import Parameters, parameter
+from jaxba.engine._parameters import Parameters, parameter
 from jaxba.scene import (
     Footprints,
     Photo,

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxba._errors import JaxbaError
-from jaxba.pipeline._parameters import Parameters, parameter
-from jaxba.pipeline._words import some
+from jaxba.engine._parameters import Parameters, parameter
+from jaxba.engine._words import some
 from jaxba.scene import Features, Photo, Tracks, ViewGraph, build_tracks
 
 _NAMED = 5  # images and pairs of each group that a message names

@@ -1,5 +1,8 @@
-"""Figures of a result."""
+"""What is said of a run: findings, summary, status, pictures, diagnosis, verification of the exports.
 
-from jaxba.report._picture import Picture, draw_picture
+`import jaxba.report` loads nothing else: a name loads its module when it is first used (PEP 562).
+"""
 
-__all__ = ["Picture", "draw_picture"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -11,7 +11,7 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import ControlPointPrior, Observations, PositionPrior, Problem
 from jaxba.ba._check import Reason, prepare
 from jaxba.geometry import BAL, Pinhole, Pose
-from jaxba.scene import uav_block
+from jaxba.simulation import uav_block
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxba._errors import JaxbaError
 from jaxba.ba import IntrinsicsPrior, Observations, Problem, Step, Unknowns, _covariance as module, covariance
 from jaxba.geometry import AbstractLoss, Cauchy, Huber, Linear
-from jaxba.scene import Survey, uav_block
+from jaxba.simulation import Survey, uav_block
 
 
 def at_truth(survey: Survey) -> Problem:

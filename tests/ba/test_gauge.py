@@ -15,7 +15,7 @@ from jaxba.ba import Observations, Problem, Step, Unknowns, free_gauge
 from jaxba.ba._gauge import require_gauge
 from jaxba.ba.groups import AttitudePrior, ControlPointPrior, IntrinsicsPrior, LeverArmPrior, PositionPrior
 from jaxba.geometry import Pinhole, Pose
-from jaxba.scene import uav_block
+from jaxba.simulation import uav_block
 
 TRANSLATIONS = ("translation x", "translation y", "translation z")
 ROTATIONS = ("rotation about x", "rotation about y", "rotation about z")

@@ -7,7 +7,7 @@ import pytest
 from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem, quality, reprojection_errors
 from jaxba.geometry import OpenCVFisheye, Pinhole, Pose
-from jaxba.scene import Survey, uav_block
+from jaxba.simulation import Survey, uav_block
 
 
 @pytest.fixture(scope="module")

@@ -1,16 +1,11 @@
 """The adjust stage: its outputs fit together, and its parameters reach the rounds."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from simulated import Simulated, simulate
 
 from jaxba.pipeline import adjust
 from jaxba.pipeline.adjust import Inputs, Outputs, Params
-
-sys.path.append(str(Path(__file__).parents[1] / "sfm"))
-from simulated import Simulated, simulate
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from PIL import Image
 from small_survey import NUM_PHOTOS, Survey
 
 from jaxba import JaxbaError
-from jaxba.pipeline import Run, _store as store, changed, default_settings, summary
+from jaxba.pipeline import Run, changed, default_settings
+from jaxba.report import summary
 
 SAME_PLACE = ("crs.min_positions=1",)
 
@@ -208,7 +209,7 @@ def test_a_file_that_cannot_be_read_stops_the_run_by_name(
     def fail(path: Path) -> str:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
-    monkeypatch.setattr("jaxba.pipeline._project.sha256", fail)
+    monkeypatch.setattr("jaxba.engine._project.sha256", fail)
     with pytest.raises(JaxbaError, match=r"SIM_0001\.JPG: cannot be read \(Permission denied\); check its permissions"):
         Survey(made.photos, tmp_path / "project").run(until="metadata")
 

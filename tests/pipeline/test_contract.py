@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from small_survey import Survey
 
-from jaxba.pipeline import STAGES, _store
+from jaxba.engine import _store
+from jaxba.engine._fingerprint import fingerprint
+from jaxba.engine._key import Key
+from jaxba.engine._parameters import Parameters
+from jaxba.pipeline import STAGES
 from jaxba.pipeline._events import Run
-from jaxba.pipeline._fingerprint import fingerprint
-from jaxba.pipeline._key import Key
-from jaxba.pipeline._parameters import Parameters
 from jaxba.pipeline._stages import Stage
 
 EVERY = pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)

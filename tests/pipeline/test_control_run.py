@@ -9,10 +9,10 @@ from small_survey import Survey
 
 from jaxba._errors import JaxbaError
 from jaxba.io import read_tile
-from jaxba.pipeline import summary
-from jaxba.pipeline._control_summary import control_rows
 from jaxba.pipeline._events import Run
-from jaxba.pipeline.verification import Params, verify
+from jaxba.report import summary
+from jaxba.report._control_summary import control_rows
+from jaxba.report.verification import Params, verify
 
 
 @pytest.fixture(scope="module")

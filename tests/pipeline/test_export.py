@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import resource
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import pyogrio
 import pytest
 import shapely
+from blocks import Flown, flown_block, project
 from PIL import Image
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
@@ -22,9 +22,6 @@ from jaxba._errors import JaxbaError
 from jaxba.io import read_tile
 from jaxba.pipeline import adjust, crs, export
 from jaxba.scene import Left, Photo, Position, Reference
-
-sys.path.append(str(Path(__file__).parents[1] / "io"))
-from blocks import Flown, flown_block, project
 
 LON, LAT, HEIGHT = -92.0, 46.8, 198.0
 FILES = {

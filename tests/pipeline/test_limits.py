@@ -10,11 +10,12 @@ import pytest
 from small_survey import NUM_PHOTOS, Survey
 
 from jaxba import JaxbaError
-from jaxba.pipeline import Event, Resources, features
-from jaxba.pipeline._key import Key
+from jaxba.engine import Resources
+from jaxba.engine._key import Key
+from jaxba.engine._store import read_record
+from jaxba.pipeline import Event, features
 from jaxba.pipeline._limits import check_failures, check_store, store_bytes
 from jaxba.pipeline._stages import run_photo
-from jaxba.pipeline._store import read_record
 from jaxba.scene import Left, Photo
 
 

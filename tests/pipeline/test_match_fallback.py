@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
+from jaxba.engine._fingerprint import fingerprint
+from jaxba.engine._key import Key
+from jaxba.engine._store import save
 from jaxba.pipeline import _stages, default_settings, match, metadata, pairs, tracks
 from jaxba.pipeline._fallback import WithFallback, detect_fallback
-from jaxba.pipeline._fingerprint import fingerprint
-from jaxba.pipeline._key import Key
 from jaxba.pipeline._pair_record import Fallback, Missed, pair_lines
-from jaxba.pipeline._store import save
 from jaxba.scene import Block, EdgeStatus, Features, Photo, Reference, Tracks
 from jaxba.sfm._complete import complete_tracks
 from jaxba.vision import decode, detect_features

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxba._errors import JaxbaError
 from jaxba.pipeline import pairs
 from jaxba.scene import Photo, Reference, components
-from jaxba.scene._flight import flight_plan
+from jaxba.simulation._flight import flight_plan
 
 WIDTH, HEIGHT, FOCAL = 5472, 3648, 3650.0
 

@@ -13,9 +13,10 @@ import pytest
 from small_survey import FAST, NUM_PHOTOS, Survey, repaint
 
 from jaxba import JaxbaError
-from jaxba.pipeline import NAMES, Event, adjust, changed, default_settings, run_pipeline, start, summary
-from jaxba.pipeline._fingerprint import fingerprint
+from jaxba.engine._fingerprint import fingerprint
+from jaxba.pipeline import NAMES, Event, adjust, changed, default_settings, run_pipeline, start
 from jaxba.pipeline._settings import from_toml
+from jaxba.report import summary
 
 FIRST, LAST = "SIM_0001.JPG", f"SIM_{NUM_PHOTOS:04d}.JPG"
 

@@ -4,8 +4,8 @@ from typing import get_args, get_type_hints
 import pytest
 
 from jaxba import JaxbaError
+from jaxba.engine._parameters import Parameters, allowed, parameter
 from jaxba.pipeline import STAGES, changed, default_settings
-from jaxba.pipeline._parameters import Parameters, allowed, parameter
 from jaxba.pipeline._settings import explained, from_toml, to_toml
 
 EVERY = [(stage, field) for stage in STAGES for field in dataclasses.fields(stage.module.Params)]

@@ -17,10 +17,11 @@ import pytest
 from PIL import Image
 from small_survey import repaint
 
-from jaxba.pipeline import Resources, project_settings, status
-from jaxba.pipeline._workers import memory_for
-from jaxba.pipeline.diagnosis import diagnose
-from jaxba.pipeline.simulate import Params, write_survey
+from jaxba.engine import Resources
+from jaxba.engine._workers import memory_for
+from jaxba.report import project_settings, status
+from jaxba.report.diagnosis import diagnose
+from jaxba.simulation.photos import Params, write_survey
 
 TRUNCATED, BLACK, CRASHES, HANGS, LARGE = (f"SIM_{i:04d}.JPG" for i in (14, 26, 38, 3, 50))
 CRASH_MARK, HANG_MARK = b"planted crash", b"planted hang"

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.truth import Figure, compare, markdown
 from jaxba.pipeline import changed, default_settings, run_pipeline
-from jaxba.pipeline.simulate import Params, write_survey
+from jaxba.simulation.photos import Params, write_survey
 
 pytestmark = pytest.mark.slow
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jaxba.engine._fingerprint import fingerprint
 from jaxba.pipeline import features
-from jaxba.pipeline._fingerprint import fingerprint
 from jaxba.pipeline._tuning import Tuning, tune
 from jaxba.scene import Photo
 from jaxba.vision import ImageStatistics

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 
-from jaxba.scene import Block, LocalFrame, Photo, Reference, Survey, Tracks, ViewGraph, uav_block
+from jaxba.scene import Block, LocalFrame, Photo, Reference, Tracks, ViewGraph
+from jaxba.simulation import Survey, uav_block
 
 FRAME = LocalFrame(
     latitude_deg=50.0, longitude_deg=14.0, height_m=300.0, crs="EPSG:32633", epsg=32633,

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxba.scene import EdgeStatus, LocalFrame, Photo, Reference, Survey, Tracks, ViewGraph, uav_block
+from jaxba.scene import EdgeStatus, LocalFrame, Photo, Reference, Tracks, ViewGraph
+from jaxba.simulation import Survey, uav_block
 
 FRAME = LocalFrame(
     latitude_deg=50.0, longitude_deg=-0.1, height_m=30.0, crs="EPSG:32630", epsg=32630,

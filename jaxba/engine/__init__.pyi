@@ -1,0 +1,6 @@
+from ._fingerprint import code_version as code_version, fingerprint as fingerprint
+from ._key import Key as Key
+from ._lock import holder as holder, locked as locked
+from ._parameters import Parameters as Parameters, parameter as parameter
+from ._project import Given as Given, Project as Project
+from ._workers import Resources as Resources

@@ -1,0 +1,121 @@
+"""Fingerprints: equal for equal values, whatever file, folder or process they come from.
+
+`fingerprint(value)` goes over a tree of dataclasses, arrays and plain values; paths count as nothing, since a moved
+folder holds the same photos. `code_version(module)` covers the source of a module and of all of jaxba that it imports,
+also inside its functions: a changed solver reruns what is solved with it, and nothing else.
+"""
+
+import ast
+import dataclasses
+import enum
+import functools
+import hashlib
+import importlib.util
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def fingerprint(*values: Any) -> str:
+    """Return 32 hexadecimal digits of the contents of the values.
+
+    >>> fingerprint((1, "a")) == fingerprint((1, "a")), fingerprint(1) == fingerprint(1.0)
+    (True, False)
+    """
+    state = hashlib.sha256()
+    for part in _parts(values):
+        state.update(part)
+    return state.hexdigest()[:32]
+
+
+def _parts(value: Any) -> Iterator[bytes | memoryview]:
+    """Yield the bytes of a value: a tag of its kind and length before its contents, so that no two trees agree."""
+    if isinstance(value, Path):
+        return
+    if isinstance(value, enum.Enum):
+        value = value.value
+    if value is None or isinstance(value, bool | int | float | str | bytes):
+        text = value if isinstance(value, bytes) else repr(value).encode()
+        yield f"{type(value).__name__}{len(text)}:".encode()
+        yield text
+    elif isinstance(value, np.ndarray | np.generic):
+        array = np.ascontiguousarray(value)
+        yield f"array{array.dtype.str}{array.shape}:".encode()
+        yield array.reshape(-1).view(np.uint8).data
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield f"{type(value).__name__}(".encode()
+        for field in dataclasses.fields(value):
+            yield f"{field.name}=".encode()
+            yield from _parts(getattr(value, field.name))
+        yield b")"
+    elif (digests := getattr(value, "digests", None)) is not None:  # stored on disk, digests beside it
+        yield from _parts(digests)
+    elif isinstance(value, Mapping):
+        yield f"map{len(value)}(".encode()
+        for key in sorted(value):
+            yield from _parts(key)
+            yield from _parts(value[key])
+        yield b")"
+    elif isinstance(value, tuple | list):
+        yield f"list{len(value)}(".encode()
+        for entry in value:
+            yield from _parts(entry)
+        yield b")"
+    else:
+        raise TypeError(f"no fingerprint of a {type(value).__name__}")
+
+
+@functools.cache
+def code_version(module: str) -> str:
+    """Return a fingerprint of the source of a module of jaxba and of all that it imports of jaxba, directly or not."""
+    sources: dict[str, bytes] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        path = _source(name)
+        if name in sources or path is None:
+            continue
+        sources[name] = path.read_bytes()
+        waiting.extend(_imports(name, sources[name]))
+    return fingerprint(sources)
+
+
+@functools.cache
+def _source(module: str) -> Path | None:
+    """Return the file of a module of jaxba; None for other modules."""
+    if not module.startswith("jaxba."):
+        return None
+    found = importlib.util.find_spec("jaxba")
+    assert found is not None and found.origin is not None
+    path = Path(found.origin).parent.joinpath(*module.split(".")[1:])
+    for candidate in (path.with_suffix(".py"), path / "__init__.py"):
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def _imports(name: str, source: bytes) -> Iterator[str]:
+    """Yield the modules of jaxba that a module imports; a name from a package is followed to where it is defined."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("jaxba"):
+            for alias in node.names:
+                yield _home(node.module, alias.name)
+
+
+@functools.cache
+def _home(module: str, name: str) -> str:
+    """Return the module behind `from module import name`: a submodule, the source of a package's name, or itself."""
+    if _source(f"{module}.{name}") is not None:
+        return f"{module}.{name}"
+    path = _source(module)
+    if path is None or path.name != "__init__.py":
+        return module
+    stub = path.with_suffix(".pyi")  # of a package whose names load their modules when they are first used
+    for node in ast.walk(ast.parse((stub if stub.is_file() else path).read_bytes())):
+        if isinstance(node, ast.ImportFrom) and node.module and any(a.name == name for a in node.names):
+            return _home(f"{module}.{node.module}" if node.level else node.module, name)
+    return module

@@ -1,0 +1,209 @@
+"""The project folder: where each stage's work lies, and which photos the folder of photos holds.
+
+project/
+  jaxba.toml           every parameter of the last run
+  run.json             the folders and lists that it was given, and the stage that it is in
+  photos.json          size, time and SHA-256 of each file, so that a file is read again only when it changed
+  stages/<stage>/      what the stage made; features and match hold a folder a photo
+  export/              the results
+  summary.json         what became of each stage and each photo
+  .lock                held by the run that works here
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxba._errors import JaxbaError
+from jaxba.engine._store import cannot_write, remove_leftovers, sha256
+from jaxba.scene import PhotoFile
+
+SETTINGS, SUMMARY = "jaxba.toml", "summary.json"
+_RUN, _PHOTOS = "run.json", "photos.json"
+_GEOTAGS = "geo.txt"
+_LISTS = ("geotags", "gcp", "check")
+_LONGEST_NAME = 180  # bytes of a folder's name, which mostly may have 255
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """What a run was given beside its parameters: the folder of photos, and lists.
+
+    - `geotags`: replaces the photos' tags. `gcp`, `check`: surveyed points and their marks.
+    """
+
+    photos: Path
+    geotags: Path | None = None
+    gcp: Path | None = None
+    check: Path | None = None
+
+
+class Project:
+    """Paths of a project folder, which is made if it is not there; with `make` off one that must be there."""
+
+    def __init__(self, folder: Path, *, make: bool = True) -> None:
+        self.folder = folder
+        self.export = folder / "export"
+        if make:
+            self._make(folder)
+        elif not (folder / _RUN).is_file():
+            raise JaxbaError(f"{folder}: is no project; give the folder that `jaxba run --out` was given.")
+
+    @staticmethod
+    def _make(folder: Path) -> None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            probe = folder / f".{os.getpid()}.probe"
+            probe.touch()
+            probe.unlink()
+        except NotADirectoryError:
+            raise JaxbaError(f"{folder}: a file is in the way; choose another --out.") from None
+        except FileExistsError:
+            raise JaxbaError(f"{folder}: is a file; choose a folder for --out.") from None
+        except OSError as error:
+            raise cannot_write(folder, error) from error
+
+    def stage(self, name: str, photo: str | None = None) -> Path:
+        """Return the folder of what a stage made, or made of one photo."""
+        folder = self.folder / "stages" / name
+        return folder if photo is None else folder / _folder_name(photo)
+
+    def remove_leftovers(self) -> None:
+        """Remove what a run that was killed left half written."""
+        stages = self.folder / "stages"
+        for folder in (self.folder, stages, *(path for path in stages.glob("*") if path.is_dir())):
+            remove_leftovers(folder)
+
+    def write_given(self, given: Given, stage: str | None) -> None:
+        """Write what a run was given and the stage that it is in; None: it has ended."""
+        paths = {name: None if path is None else str(path.absolute()) for name, path in vars(given).items()}
+        self.write_json(_RUN, {**paths, "stage": stage})
+
+    def read_given(self) -> tuple[Given, str | None]:
+        """Return what the last run was given, and the stage in which it was killed, or is now; None where it ended."""
+        content = self.read_json(_RUN)
+        if not isinstance(content, dict) or "stage" not in content:
+            raise JaxbaError(f"{self.folder / _RUN}: is damaged; run again.")
+        paths = {name: None if (text := content[name]) is None else Path(text) for name in _LISTS}
+        return Given(photos=Path(content["photos"]), **paths), content["stage"]
+
+    def write_json(self, name: str, content: object) -> None:
+        """Write a JSON file of the project, whole or not at all, where it changes."""
+        self.write_text(name, json.dumps(content, indent=1) + "\n")
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a text file of the project, whole or not at all, where it changes."""
+        path = self.folder / name
+        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        with contextlib.suppress(OSError):
+            if path.read_bytes() == text.encode():
+                return
+        try:
+            partial.write_bytes(text.encode())
+            partial.replace(path)
+        except OSError as error:
+            partial.unlink(missing_ok=True)
+            raise cannot_write(path, error) from error
+
+    def read_json(self, name: str) -> object:
+        """Return the content of a JSON file of the project; None where there is none or it is damaged."""
+        try:
+            return json.loads((self.folder / name).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+
+    def photo_files(self, photos: Path, *, remember: bool = True) -> tuple[PhotoFile, ...]:
+        """Return the files below the folder of photos, by name, with the SHA-256 of each.
+
+        A file whose size and time are those of the last run is not read again, and with `remember` those of this one
+        are kept. Hidden files and the project itself, where it lies inside the folder, are passed over.
+        """
+        paths = _files_below(photos, self.folder)
+        known = self.read_json(_PHOTOS)
+        known = known if isinstance(known, dict) else {}
+        found, table = [], {}
+        for name, path in paths:
+            try:
+                stat = path.stat()
+                stamp = [stat.st_size, stat.st_mtime_ns]
+                before = known.get(name)
+                digest = before[2] if isinstance(before, list) and before[:2] == stamp else sha256(path)
+            except OSError as error:
+                raise JaxbaError(
+                    f"{path}: cannot be read ({error.strerror}); check its permissions, or delete it."
+                ) from error
+            table[name] = [*stamp, digest]
+            found.append(PhotoFile(name=name, path=path.absolute(), sha256=digest))
+        if remember:
+            self.write_json(_PHOTOS, table)
+        return tuple(found)
+
+
+def read_lists(given: Given) -> dict[str, Any]:
+    """Return name and text of the lists, as `Done` takes them; `geo.txt` among the photos is one of tags."""
+    geotags = given.geotags
+    if geotags is None and (given.photos / _GEOTAGS).is_file():
+        geotags = given.photos / _GEOTAGS
+    return {
+        "geotags": _read_list(geotags, "a geo.txt or CSV"),
+        "gcp": _read_list(given.gcp, "a gcp_list.txt or CSV"),
+        "check": _read_list(given.check, "a gcp_list.txt or CSV"),
+    }
+
+
+def _read_list(path: Path | None, kind: str) -> tuple[str, str] | None:
+    """Return name and text of a list; None where none is given. `kind`: what it is to be, for messages."""
+    if path is None:
+        return None
+    if not path.is_file():
+        raise JaxbaError(f"{path}: there is no such file; give {kind}.")
+    try:
+        return str(path.name), path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise JaxbaError(f"{path}: cannot be read as text ({error}); give {kind} in UTF-8.") from error
+
+
+def _files_below(photos: Path, project: Path) -> list[tuple[str, Path]]:
+    """Return name and path of the files below a folder, links followed, by name."""
+    if not photos.exists():
+        raise JaxbaError(f"{photos}: there is no such folder; give the folder that holds the photos.")
+    if not photos.is_dir():
+        raise JaxbaError(f"{photos}: is a file; give the folder that holds the photos.")
+    if photos.resolve() == project.resolve():
+        raise JaxbaError(f"{photos}: is the folder of the photos; choose another folder for --out.")
+    been, found = {project.resolve()}, []
+    for root, folders, names in os.walk(photos, onerror=_raise_unreadable, followlinks=True):
+        place = Path(root).resolve()
+        if place in been:  # the project itself, or a link back
+            folders.clear()
+            continue
+        been.add(place)
+        folders[:] = sorted(f for f in folders if not f.startswith("."))
+        for name in names:
+            path = Path(root) / name
+            if name.startswith(".") or not (path.is_file() or path.is_symlink()):  # a broken link is said later
+                continue
+            found.append((path.relative_to(photos).as_posix(), path))
+    for name, _ in found:
+        if re.search("[\x00-\x1f\x7f\ud800-\udfff]", name):  # the last: bytes that are no UTF-8
+            raise JaxbaError(
+                f"{photos}: the file {name!a} has characters in its name that not every program can write; rename it."
+            )
+    return sorted(found)
+
+
+def _raise_unreadable(error: OSError) -> None:
+    raise JaxbaError(f"{error.filename}: cannot be read ({error.strerror}); check its permissions.") from error
+
+
+def _folder_name(photo: str) -> str:
+    """Return a photo's name as that of one folder; a long one is cut, and told apart by a digest."""
+    name = re.sub(r'[%/\\:*?"<>|]', lambda match: f"%{ord(match[0]):02X}", photo)
+    if len(name.encode()) <= _LONGEST_NAME:
+        return name
+    return f"{name.encode()[:_LONGEST_NAME].decode(errors='ignore')}-{hashlib.sha256(photo.encode()).hexdigest()[:16]}"

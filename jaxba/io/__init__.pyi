@@ -1,0 +1,31 @@
+from ._atomic import refuse_same_file as refuse_same_file, write_atomically as write_atomically
+from ._bal import (
+    read_bal as read_bal,
+    what_bal_cannot_hold as what_bal_cannot_hold,
+    write_bal as write_bal,
+)
+from ._cloud import Cloud as Cloud
+from ._colmap import (
+    write_colmap_binary as write_colmap_binary,
+    write_colmap_text as write_colmap_text,
+)
+from ._crs import CrsText as CrsText
+from ._csv_cloud import write_csv_cloud as write_csv_cloud
+from ._csv_control import ControlTable as ControlTable, write_csv_control as write_csv_control
+from ._gcp import (
+    ControlList as ControlList,
+    Mark as Mark,
+    SurveyedPoint as SurveyedPoint,
+    parse_control as parse_control,
+)
+from ._geopackage import write_geojson as write_geojson, write_geopackage as write_geopackage
+from ._geotag_match import match_geotags as match_geotags, photo_finder as photo_finder
+from ._geotags import Geotag as Geotag, Geotags as Geotags, parse_geotags as parse_geotags
+from ._las import write_las as write_las
+from ._opensfm import write_opensfm as write_opensfm
+from ._ply import write_ply as write_ply
+from ._problem import read_problem as read_problem
+from ._read_colmap import ColmapModel as ColmapModel, read_colmap_text as read_colmap_text
+from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
+from ._sites import Sites as Sites, make_sites as make_sites
+from ._tile import read_tile as read_tile, write_tile as write_tile

@@ -1,6 +1,0 @@
-"""Diagnosis of a project: what looks poor, the likely cause with its figures, and the cure; a file a group of rules."""
-
-from jaxba.pipeline.diagnosis._diagnosis import Diagnosis
-from jaxba.pipeline.diagnosis._rules import RULES, diagnose
-
-__all__ = ["RULES", "Diagnosis", "diagnose"]

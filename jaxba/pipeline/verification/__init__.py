@@ -1,6 +1,0 @@
-"""Verification of a project's exports, read anew from the disk: files and form, numbers, errors, CRS and place."""
-
-from jaxba.pipeline.verification._check import Check
-from jaxba.pipeline.verification.verify import Params, verify
-
-__all__ = ["Check", "Params", "verify"]

@@ -1,0 +1,86 @@
+"""What a run tells of control and check points."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxba.engine._words import many
+
+_SHOWN = 10
+
+
+def control_lines(outputs: Any) -> tuple[str, list[str]]:
+    """Return what the control stage made in a line, and its notes."""
+    control = outputs.control
+    if not control.num_points and not outputs.notes:
+        return "no list of control points", []
+    checks = int(control.is_check.sum())
+    count = control.num_points - checks
+    first = f"{many(count, 'control point')}, {many(checks, 'check point')}; {many(len(control.mark_point), 'mark')}"
+    images = len(np.unique(control.mark_image))
+    left = [f"Left out: {entry.name}: {entry.reason}." for entry in outputs.left_out]
+    if len(left) > _SHOWN:
+        left = [*left[:_SHOWN], f"and {len(left) - _SHOWN} more such, each with its reason in summary.json."]
+    return f"{first} in {many(images, 'photo')}", [*outputs.notes, *left]
+
+
+def control_facts(done: Any) -> dict[str, Any]:
+    """Return the points and how the result fits them, as plain values."""
+    control, left_out = done.control.control, done.control.left_out
+    facts: dict[str, Any] = {
+        "asked_method": control.method,
+        "left_out": [{"name": entry.name, "reason": entry.reason} for entry in left_out],
+    }
+    fit = None if done.adjust is None else done.adjust.control
+    if fit is not None:
+        use = np.isfinite(fit.residual_m).any(axis=1)
+        for role, rms, mine in (("control", fit.control_rms_m, ~control.is_check), ("check", fit.check_rms_m, None)):
+            facts[role] = _group(control, fit, rms, use & (control.is_check if mine is None else mine))
+        facts |= {"method": fit.method, "gnss_minus_control_m": fit.gnss_minus_control_m.tolist()}
+    facts["points"] = [_point(control, fit, k) for k in range(control.num_points)]
+    return facts
+
+
+def control_rows(facts: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """Return the rows of the summary in the terminal: RMS of control and of check points, and the worst of each."""
+    rows = []
+    for role in ("control", "check"):
+        group = (facts or {}).get(role)
+        if group is None or not group["num"]:
+            continue
+        axes = zip(("east", "north", "up"), group["rms_m"], strict=True)
+        used = {axis: value for axis, value in axes if value is not None}
+        figures = ", ".join(f"{value:.3f}" for value in used.values())
+        text = f"RMS {figures} m {', '.join(used)} over {many(group['num'], 'point')}"
+        rows.append((role, f"{text}; worst {group['worst']} by {group['worst_m']:.3f} m"))
+    return rows
+
+
+def _group(control: Any, fit: Any, rms_m: np.ndarray, rows: np.ndarray) -> dict[str, Any]:
+    """Return the figures of the control or of the check points that have residuals."""
+    result: dict[str, Any] = {"num": int(rows.sum()), "rms_m": rms_m.tolist()}
+    if rows.any():
+        length = np.where(rows, np.sqrt(np.nansum(fit.residual_m**2, axis=1)), -1.0)
+        worst = int(np.argmax(length))
+        horizontal = np.where(rows, np.hypot(fit.residual_m[:, 0], fit.residual_m[:, 1]), np.nan)
+        result |= {
+            "rms_horizontal_m": float(np.sqrt(np.nanmean(horizontal**2))),
+            "worst": control.names[worst],
+            "worst_m": float(length[worst]),
+        }
+    return result
+
+
+def _point(control: Any, fit: Any, k: int) -> dict[str, Any]:
+    marks = int(np.count_nonzero(control.mark_point == k))
+    result = {"name": control.names[k], "role": "check" if control.is_check[k] else "control", "marks": marks}
+    if fit is None:
+        return result
+    return result | {
+        "marks_used": int(fit.num_marks[k]),
+        "residual_m": fit.residual_m[k].tolist(),
+        "std_m": fit.std_m[k].tolist(),
+        "mark_rms_px": float(fit.mark_rms_px[k]),
+        "over_sigma": float(fit.over_sigma[k]),
+        "suspect": bool(fit.is_suspect[k]),
+    }

@@ -1,0 +1,76 @@
+"""Positions of a list beside those of the photos' tags, which are read again, and where both lie on earth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from pyproj import Geod, Transformer
+from pyproj.exceptions import ProjError
+
+from jaxba._errors import JaxbaError
+from jaxba.report._recorded import Recorded
+from jaxba.scene import Photo, PhotoFile, Position
+
+_COMPARED = 20  # photos whose tags are read again
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Against:
+    """Positions of a list beside those of the same photos' tags, WGS 84.
+
+    - `listed`, `tagged`: as they are. `away_m`: horizontal distance. `up_m`: height of the list minus that of the tags.
+    """
+
+    photos: tuple[Photo, ...]
+    listed: tuple[Position, ...]
+    tagged: tuple[Position, ...]
+    away_m: Float[np.ndarray, " photos"]
+    up_m: Float[np.ndarray, " photos"]
+
+
+def wgs84(position: Position) -> tuple[float, float]:
+    """Return longitude and latitude; NaN where a position does not fit its CRS."""
+    try:
+        return Transformer.from_crs(position.crs, "EPSG:4326", always_xy=True).transform(position.x, position.y)
+    except ProjError:
+        return float("nan"), float("nan")
+
+
+def against_tags(case: Recorded) -> Against | None:
+    """Return positions of a list beside those of the tags; None where there is no list, or the photos are gone."""
+    from jaxba.vision import read_photo
+
+    if case.done.metadata is None:
+        return None
+    pairs = []
+    for photo in case.done.photos[:_COMPARED]:
+        if photo.position is None or photo.position.source in ("EXIF", "XMP") or not photo.path.is_file():
+            continue
+        try:
+            tags = read_photo(PhotoFile(name=photo.name, path=photo.path, sha256=photo.sha256), max_focal_deviation=0.5)
+        except JaxbaError:  # its tags cannot be read any more: nothing to hold the list against
+            continue
+        if tags.position is not None and tags.position.source != photo.position.source:
+            pairs.append((photo, photo.position, tags.position))
+    if not pairs:
+        return None
+    photos, listed, tagged = zip(*pairs, strict=True)
+    first, second = (np.array([wgs84(position) for position in entry]) for entry in (listed, tagged))
+    up = [np.nan if a.z_m is None or b.z_m is None else a.z_m - b.z_m for a, b in zip(listed, tagged, strict=True)]
+    return Against(
+        photos=photos, listed=listed, tagged=tagged, away_m=apart_m(first, second), up_m=np.array(up, float)
+    )  # fmt: skip
+
+
+def apart_m(first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """Return how far places are apart; infinity where one of them is none on earth."""
+    valid = np.isfinite(first).all(axis=1) & (np.abs(first[:, 1]) <= 90)
+    away = np.full(len(first), np.inf)
+    if valid.any():
+        ends = first[valid, 0], first[valid, 1], second[valid, 0], second[valid, 1]
+        away[valid] = Geod(ellps="WGS84").inv(*ends)[2]
+    return away
+
+
+def moved(position: Position, x: float, y: float, crs: str | None = None) -> Position:
+    return Position(crs=crs or position.crs, x=x, y=y)

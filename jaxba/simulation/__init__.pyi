@@ -1,0 +1,12 @@
+from . import photos as photos, synthetic as synthetic
+from ._flight import Terrain as Terrain, flight_plan as flight_plan, smooth_terrain as smooth_terrain
+from ._ground import Ground as Ground, paint_ground as paint_ground
+from ._render import (
+    expose as expose,
+    ground_points as ground_points,
+    pixel_rays as pixel_rays,
+    render as render,
+)
+from ._survey import survey_frame as survey_frame
+from ._write_photo import PhotoTags as PhotoTags, jpeg_with_tags as jpeg_with_tags
+from .synthetic import DRONE_CAMERA as DRONE_CAMERA, Survey as Survey, Truth as Truth, uav_block as uav_block

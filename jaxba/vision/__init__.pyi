@@ -1,0 +1,20 @@
+from ._attitude_tags import attitude_from_nadir_body as attitude_from_nadir_body
+from ._decode import Pixels as Pixels, decode as decode
+from ._features import (
+    OrbOptions as OrbOptions,
+    detect_features as detect_features,
+    grid_coverage as grid_coverage,
+)
+from ._nearest import (
+    Descriptors as Descriptors,
+    match_descriptors as match_descriptors,
+    prepare_descriptors as prepare_descriptors,
+)
+from ._overlap import common_ground as common_ground
+from ._photo import (
+    IMAGE_SUFFIXES as IMAGE_SUFFIXES,
+    RAW_SUFFIXES as RAW_SUFFIXES,
+    read_photo as read_photo,
+)
+from ._statistics import ImageStatistics as ImageStatistics, measure_image as measure_image
+from ._two_view import Pinhole as Pinhole, PosePrior as PosePrior, TwoView as TwoView, verify as verify

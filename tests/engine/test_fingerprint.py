@@ -1,0 +1,79 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxba.engine._fingerprint import _imports, code_version, fingerprint
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    a: object
+    b: object
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ((1, 2), (12,)),
+        (("a", "b"), ("ab",)),
+        (1, 1.0),
+        (True, 1),
+        (None, "None"),
+        (np.zeros(4), np.zeros((2, 2))),
+        (np.zeros(2, np.float32), np.zeros(1)),
+        (np.array([0.0]), np.array([-0.0])),
+        ({"a": 1}, {"b": 1}),
+        (Pair(1, (2,)), Pair((1,), 2)),
+        (Pair(1, 2), (1, 2)),
+    ],
+)
+def test_different_values_have_different_fingerprints(one, other):
+    assert fingerprint(one) != fingerprint(other)
+
+
+def test_equal_values_have_equal_fingerprints_whatever_their_memory(tmp_path):
+    array = np.arange(12.0).reshape(3, 4)
+    np.save(tmp_path / "a.npy", array)
+    mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
+    assert fingerprint(array) == fingerprint(mapped) == fingerprint(np.asfortranarray(array))
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+
+
+def test_paths_count_as_nothing():
+    assert fingerprint(Pair(Path("/a"), 1)) == fingerprint(Pair(Path("/b"), 1))
+
+
+def test_an_unknown_kind_is_refused():
+    with pytest.raises(TypeError, match="no fingerprint of a object"):
+        fingerprint(object())
+
+
+def test_code_version_follows_imports_to_where_a_name_is_defined():
+    source = b"def f():\n    from jaxba.io import write_tile\n    from jaxba.scene import Left\nimport numpy"
+    assert set(_imports("x", source)) == {"jaxba.io._tile", "jaxba.scene._photo", "numpy"}
+
+
+def test_code_version_differs_by_stage_and_repeats():
+    names = ["metadata", "crs", "control", "pairs", "features", "match", "tracks", "start", "adjust", "export"]
+    versions = [code_version(f"jaxba.pipeline.{name}") for name in names]
+    assert len(set(versions)) == len(names)
+
+
+def test_code_version_changes_with_what_is_imported(monkeypatch, tmp_path):
+    from jaxba.engine import _fingerprint
+
+    changed = tmp_path / "_rotation.py"
+    original = _fingerprint._source("jaxba.geometry._rotation")
+    assert original is not None
+    changed.write_bytes(original.read_bytes() + b"\n# changed\n")
+    before = {name: code_version(name) for name in ("jaxba.ba._solve", "jaxba.pipeline.features")}
+    real = _fingerprint._source.__wrapped__
+    source = {"jaxba.geometry._rotation": changed}
+    monkeypatch.setattr(_fingerprint, "_source", lambda name: source.get(name) or real(name))
+    code_version.cache_clear()
+    after = {name: code_version(name) for name in before}
+    code_version.cache_clear()
+    assert after["jaxba.pipeline.features"] == before["jaxba.pipeline.features"]
+    assert after["jaxba.ba._solve"] != before["jaxba.ba._solve"]

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.photos import IMAGES, RESULTS, ROOT
-from jaxba.pipeline import default_settings, run_pipeline
+from jaxba.pipeline import PIPELINE, run_pipeline
 
 DETECTORS = ("sift", "orb")
 _COLUMNS = (
@@ -60,7 +60,7 @@ def measure(photos: Path, detector: str, workers: int) -> dict[str, Any]:
 def decision(photos: Path) -> str:
     """Return what `auto` takes for a set, and why."""
     with tempfile.TemporaryDirectory() as folder:
-        run = run_pipeline(photos, Path(folder) / "project", default_settings(), until="pairs")
+        run = run_pipeline(photos, Path(folder) / "project", PIPELINE.settings, until="pairs")
         return " ".join(run.done.routing.reasons)
 
 

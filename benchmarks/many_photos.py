@@ -19,8 +19,8 @@ from jaxba.engine import Resources
 from jaxba.engine._key import Key
 from jaxba.engine._pool import Item, work
 from jaxba.engine._store import Stored, load, save
-from jaxba.pipeline import default_settings, features, match
-from jaxba.pipeline._stages import run_photo
+from jaxba.engine._work import run_one
+from jaxba.pipeline import PIPELINE, features, match
 from jaxba.scene import Features, Photo, Reference
 
 WIDTH_PX, HEIGHT_PX, KEYPOINTS = 4000, 3000, 8000
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with _Peak() as peak:
             begun = time.perf_counter()
             items = [_item(folder, photos, stored, image) for image in range(options.photos - 1)]
-            ended = work(run_photo, items, Resources(workers=options.workers))
+            ended = work(run_one, items, Resources(workers=options.workers))
             failed = sum((reason or died) is not None for _, reason, died in ended)
             seconds = time.perf_counter() - begun
         inliers = np.median(load(folder / "match" / "0", match.Outputs).view_graph.num_inliers)
@@ -106,7 +106,7 @@ def _item(folder: Path, photos: tuple[Photo, ...], stored: Stored, image: int) -
         reference=reference,
         features=stored.only([image, *partners]),
     )
-    arguments = (match.__name__, folder / "match" / str(image), inputs, default_settings()["match"], _KEY)
+    arguments = (match.__name__, folder / "match" / str(image), inputs, PIPELINE.settings["match"], _KEY)
     return Item(name=str(image), arguments=arguments, need_bytes=1e9)
 
 

@@ -60,3 +60,5 @@ from .io import (
     write_tile as write_tile,
 )
 from .simulation import synthetic as synthetic
+
+__version__: str

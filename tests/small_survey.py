@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxba.pipeline import Event, Run, changed, default_settings, run_pipeline
+from jaxba.engine import changed
+from jaxba.pipeline import PIPELINE, Event, Run, run_pipeline
 from jaxba.simulation.photos import Params, write_survey
 
 FAST = ("features.nfeatures=2000",)
@@ -44,7 +45,7 @@ class Survey:
         workers: int = 2,
         tell: Callable[[Event], None] = lambda event: None,
     ) -> Run:
-        settings = changed(default_settings(), [*FAST, f"workers.workers={workers}", *changes])
+        settings = changed(PIPELINE.settings, [*FAST, f"workers.workers={workers}", *changes])
         return run_pipeline(
             self.photos, self.project, settings, until=until, geotags=geotags, gcp=gcp, check=check, tell=tell
         )

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from jaxba.cli import main
-from jaxba.pipeline import default_settings, explained, from_toml
+from jaxba.engine import explained, from_toml
+from jaxba.pipeline import PIPELINE
 
 
 @pytest.fixture
@@ -28,13 +29,13 @@ def cli(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp
 def test_what_is_printed_is_a_file_that_can_be_used(cli, tmp_path: Path):
     code, out, _ = cli("config")
     (tmp_path / "printed.toml").write_text(out)
-    assert code == 0 and from_toml(tmp_path / "printed.toml", default_settings()) == default_settings()
+    assert code == 0 and from_toml(tmp_path / "printed.toml", PIPELINE.settings) == PIPELINE.settings
     assert "# nearest over second nearest descriptor distance (default 0.75; 0.6 to 0.85)\nratio = 0.75\n" in out
 
 
 def test_every_parameter_is_explained_with_default_range_and_meaning(cli):
     text = re.sub(r"\s+", " ", cli("config", "--explain")[1])
-    for name, default, allowed, meaning in explained(default_settings()):
+    for name, default, allowed, meaning in explained(PIPELINE.settings):
         assert re.sub(r"\s+", " ", f"{name} {default}{f' ({allowed})' if allowed else ''}: {meaning}") in text
     rows = json.loads(cli("config", "--json")[1])["parameters"]
     assert {"name": "match.ratio", "default": "0.75", "allowed": "0.6 to 0.85"}.items() <= rows[
@@ -77,7 +78,7 @@ PUBLISHED = {  # the defaults and ranges that users of such pipelines know
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_the_published_defaults_and_ranges_are_kept(name: str):
-    found = {row[0]: row[1:3] for row in explained(default_settings())}
+    found = {row[0]: row[1:3] for row in explained(PIPELINE.settings)}
     assert found[name] == PUBLISHED[name]
 
 
@@ -91,13 +92,13 @@ def test_the_file_of_the_working_folder_counts_and_is_said(cli, tmp_path: Path):
     (tmp_path / "jaxba.toml").write_text("[match]\nratio = 0.7\n")
     code, _, err = cli("run", "photos")
     assert err.startswith(f"settings are those of {tmp_path / 'jaxba.toml'}\n") and "there is no photo" in err
-    assert from_toml(tmp_path / "project" / "jaxba.toml", default_settings())["match"].ratio == 0.7  # pyright: ignore
+    assert from_toml(tmp_path / "project" / "jaxba.toml", PIPELINE.settings)["match"].ratio == 0.7  # pyright: ignore
 
 
 def test_set_wins_over_the_file_and_the_file_over_the_default(cli, tmp_path: Path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "my.toml").write_text("[match]\nratio = 0.7\nmin_good = 40\n[crs]\nstd_h = 2\n")
     cli("run", "photos", "--config", "my.toml", "--set", "match.ratio=0.65")
-    settings = from_toml(tmp_path / "project" / "jaxba.toml", default_settings())
+    settings = from_toml(tmp_path / "project" / "jaxba.toml", PIPELINE.settings)
     assert (settings["match"].ratio, settings["match"].min_good) == (0.65, 40)  # pyright: ignore
     assert settings["crs"].std_h == 2.0 and settings["crs"].std_v == 5.0  # pyright: ignore

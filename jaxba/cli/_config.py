@@ -4,7 +4,8 @@ import sys
 from pathlib import Path
 
 from jaxba.cli._text import to_json, wrapped
-from jaxba.pipeline import Settings, default_settings, explained, from_toml, to_toml
+from jaxba.engine import Settings, explained, from_toml, to_toml
+from jaxba.pipeline import PIPELINE
 
 FILE = Path("jaxba.toml")
 _NAME_WIDTH = 30
@@ -26,7 +27,7 @@ def run(file: Path | None, *, explain: bool, as_json: bool) -> int:
 
 def configured(file: Path | None, *, quiet: bool) -> Settings:
     """Return the settings of a file, of `jaxba.toml` in the working folder where none is given, or the defaults."""
-    settings = default_settings()
+    settings = PIPELINE.settings
     if file is None and not FILE.is_file():
         return settings
     if file is None and not quiet:

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from jaxba.cli._text import to_json, wrapped
+from jaxba.pipeline import PIPELINE
 from jaxba.report.diagnosis import diagnose
 
 _LABEL = 8
@@ -11,7 +12,7 @@ _LABEL = 8
 
 def run(project: Path, *, as_json: bool) -> int:
     """Print each diagnosis; return 0."""
-    found = diagnose(project)
+    found = diagnose(project, PIPELINE)
     if as_json:
         print(to_json({"diagnoses": [dataclasses.asdict(diagnosis) for diagnosis in found]}))
         return 0

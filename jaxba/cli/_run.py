@@ -16,9 +16,9 @@ from jaxba.cli._main import BAD_INPUT, INTERRUPTED
 from jaxba.cli._options import WorkerOptions
 from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Progress, StageLines, steps_told
 from jaxba.cli._text import first_of, many, to_json, wrapped
-from jaxba.pipeline import Event, Run, changed, run_pipeline
-from jaxba.report import summary
-from jaxba.report._control_summary import control_rows
+from jaxba.engine import changed
+from jaxba.pipeline import Event, Run, run_pipeline
+from jaxba.report import control_rows
 
 _SUMMARY_LABEL = 12
 
@@ -88,7 +88,7 @@ def run(
     if json_lines is not None:
         json_lines.say("run_end", seconds=round(time.monotonic() - begun, 3), stages_run=list(result.stages_run))
     if as_json:
-        print(to_json(summary(result)))
+        print(to_json(result.facts))
     elif not quiet:
         _print_summary(result, out)
     return 0
@@ -100,7 +100,7 @@ def _clear(show: Progress | None) -> None:
 
 
 def _print_summary(result: Run, out: Path) -> None:
-    facts = summary(result)
+    facts = result.facts
     rows: list[tuple[str, str]] = []
     if "adjust" in facts:
         rows = _result_rows(facts["adjust"], control_rows(facts.get("control")))

@@ -31,7 +31,6 @@ from collections.abc import Callable, Iterator
 
 from jaxba.cli._text import many, to_json, wrapped
 from jaxba.pipeline import Event
-from jaxba.report import stage_lines
 
 _CLEAR = "\r\x1b[K"
 LABEL = 10
@@ -171,7 +170,7 @@ class JsonLines:
             self.say("stage_begin", stage=event.stage)
         elif event.kind == "end":
             left = [{"name": entry.name, "reason": entry.reason} for entry in event.left_out]
-            lines, seconds = stage_lines(event), round(event.seconds, 3)
+            lines, seconds = list(event.lines), round(event.seconds, 3)
             self.say("stage_end", stage=event.stage, total=event.total, seconds=seconds, lines=lines, left_out=left)
         else:
             for entry in event.left_out:
@@ -211,7 +210,7 @@ class StageLines:
     def __call__(self, event: Event) -> None:
         if event.kind != "end" or not event.total:
             return
-        first, *notes = stage_lines(event)
+        first, *notes = event.lines
         print(wrapped(event.stage, f"{first}   {event.seconds:.1f} s", LABEL), flush=True)
         for note in notes:
             if news := self._news(note):

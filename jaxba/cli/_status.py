@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxba.cli._text import to_json, wrapped
-from jaxba.pipeline import changed, from_toml
+from jaxba.engine import changed, from_toml
+from jaxba.pipeline import PIPELINE
 from jaxba.report import Status, project_settings, status
 
 _SHOWN = 10
@@ -14,10 +15,10 @@ _LABEL = 10
 
 def run(project: Path, *, config: Path | None, changes: Sequence[str], as_json: bool) -> int:
     """Print how the project stands; return 0 where all is done, else 1."""
-    settings = project_settings(project)
+    settings = project_settings(project, PIPELINE)
     if config is not None:
         settings = from_toml(config, settings)
-    found = status(project, changed(settings, changes))
+    found = status(project, PIPELINE, changed(settings, changes))
     if as_json:
         print(to_json(_facts(found)))
     else:

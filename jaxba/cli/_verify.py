@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxba.cli._text import many, to_json, wrapped
-from jaxba.pipeline import changed, from_toml
+from jaxba.engine import changed, from_toml
+from jaxba.pipeline import PIPELINE
 from jaxba.report import project_settings
 from jaxba.report.verification import Params, verify
 
@@ -14,12 +15,12 @@ _LABEL = 9
 
 def run(project: Path, *, config: Path | None, changes: Sequence[str], as_json: bool) -> int:
     """Print the checks; return 0 where none fails, else 1."""
-    settings = project_settings(project)
+    settings = project_settings(project, PIPELINE)
     if config is not None:
         settings = from_toml(config, settings)
     params = changed(settings, changes)["verify"]
     assert isinstance(params, Params)
-    checks = verify(project, params)
+    checks = verify(project, PIPELINE, params)
     bad = [check for check in checks if check.state == "FAIL"]
     if as_json:
         print(to_json({"passed": not bad, "checks": [dataclasses.asdict(check) for check in checks]}))

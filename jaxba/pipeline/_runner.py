@@ -15,18 +15,19 @@ from typing import Any
 
 from jaxba._errors import JaxbaError
 from jaxba.engine import _store
+from jaxba.engine._limits import check_failures
 from jaxba.engine._lock import locked
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._pool import Item, fewer_workers, work as work_on
 from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists
+from jaxba.engine._settings import Settings, to_toml
+from jaxba.engine._stage import Stage, left_out
+from jaxba.engine._work import Work, collected, failures, run_one, why_to_do, without_path, works
 from jaxba.engine._workers import Resources, memory_for
-from jaxba.pipeline import features
+from jaxba.pipeline._done import Done
 from jaxba.pipeline._events import Event, Run
-from jaxba.pipeline._limits import check_failures, check_store
-from jaxba.pipeline._settings import Settings, to_toml
-from jaxba.pipeline._stages import NAMES, STAGES, Done, Stage, run_photo
-from jaxba.pipeline._work import Work, collected, failures, why_to_do, without_path, works
-from jaxba.report._summary import left_out, stage_lines, summary
+from jaxba.pipeline._stages import NAMES, STAGES
+from jaxba.report import summary, told_of
 from jaxba.scene import Left
 
 
@@ -60,21 +61,23 @@ def run_pipeline(
         given = Given(photos=photos, geotags=geotags, gcp=gcp, check=check)
         done = Done(files=project.photo_files(photos), settings=settings, **read_lists(given))
         project.write_text(SETTINGS, to_toml(settings))
-        return _run_stages(project, given, done, settings, until, tell)
+        return _run_stages(project, given, done, until, tell)
 
 
-def _run_stages(
-    project: Project,
-    given: Given,
-    done: Done,
-    settings: Settings,
-    until: str | None,
-    tell: Callable[[Event], None],
-) -> Run:
+def _run_stages(project: Project, given: Given, done: Done, until: str | None, tell: Callable[[Event], None]) -> Run:
+    settings = done.settings
     resources = settings["workers"]
     assert isinstance(resources, Resources)
     stages_run: list[str] = []
     lines: dict[str, list[str]] = {}
+
+    def end(stopped: Left | None = None) -> Run:
+        """Write the summary, and that the run has ended."""
+        facts = summary(STAGES, done, stages_run=stages_run, lines=lines, stopped=stopped)
+        project.write_json(SUMMARY, facts)
+        project.write_given(given, None)
+        return Run(done, tuple(stages_run), facts)
+
     for stage in STAGES:
         begun = time.perf_counter()
         project.write_given(given, stage.name)
@@ -84,30 +87,21 @@ def _run_stages(
         except (JaxbaError, KeyboardInterrupt) as error:
             reason = str(error) or "interrupted"
             with contextlib.suppress(JaxbaError):  # what stopped the run is the news
-                _end(project, given, Run(done, tuple(stages_run), lines, Left(name=stage.name, reason=reason)))
+                end(Left(name=stage.name, reason=reason))
             raise
         setattr(done, stage.name, outputs)
-        if stage.collect is not None:
+        if stage.is_by_photo:
             setattr(done, f"{stage.name}_left_out", (*unused, *stage.useless(done, outputs)))
         if total:
             stages_run.append(stage.name)
         seconds = time.perf_counter() - begun
-        names = tuple(photo.name for photo in done.photos)
-        left_here = left_out(done).get(stage.name, ())
-        event = Event("end", stage.name, total, total, seconds, outputs, left_here, names, notes=notes)
-        lines[stage.name] = stage_lines(event)
-        tell(event)
+        left_here = left_out(STAGES, done)[stage.name]
+        first, *more = stage.module.lines(outputs, told_of(done, left_here))
+        lines[stage.name] = [first, *notes, *more]
+        tell(Event("end", stage.name, total, total, seconds, left_here, lines=tuple(lines[stage.name])))
         if stage.name == until:
             break
-    run = Run(done, tuple(stages_run), lines)
-    _end(project, given, run)
-    return run
-
-
-def _end(project: Project, given: Given, run: Run) -> None:
-    """Write the summary, and that the run has ended."""
-    project.write_json(SUMMARY, summary(run))
-    project.write_given(given, None)
+    return end()
 
 
 def _run_stage(
@@ -122,13 +116,13 @@ def _run_stage(
     items = works(project, stage, done, params)
     waiting = [item for item in items if why_to_do(project, stage, item, params)]
     if waiting:
-        tell(Event("todo", stage.name, 0, len(waiting), by_photos=stage.collect is not None))
-    if stage.collect is None:
+        tell(Event("todo", stage.name, 0, len(waiting), by_photos=stage.is_by_photo))
+    if not stage.is_by_photo:
         for item in waiting:
             _run_whole(project, stage, item, params)
         return collected(stage, done, items)[0], len(waiting), (), ()
-    if waiting and isinstance(params, features.Params):
-        check_store(project.stage(stage.name), len(items), items[0].inputs.detector, params, resources)
+    if waiting:
+        stage.refuse(project.stage(stage.name), items, params, resources)
     failed, notes = _run_photos(stage, items, waiting, params, resources, tell)
     by_name = {left.name: left for left in (*failed, *failures(items))}
     unused = tuple(by_name[name] for name in sorted(by_name))
@@ -140,7 +134,7 @@ def _run_stage(
 
 
 def _run_whole(project: Project, stage: Stage, item: Work, params: Parameters) -> None:
-    if stage.name == "export":
+    if stage.writes_files:
         with _store.written_whole(project.export) as partial:
             outputs = stage.module.run(replace(item.inputs, folder=partial), params)
     else:
@@ -172,7 +166,7 @@ def _run_photos(
         for work in waiting
     ]
     effort_done, effort = 0.0, sum(item.effort for item in queue)
-    with contextlib.closing(work_on(run_photo, queue, resources)) as ending:
+    with contextlib.closing(work_on(run_one, queue, resources)) as ending:
         for count, (item, recorded, reason) in enumerate(ending, 1):
             left = tuple(
                 Left(name=item.name, reason=without_path(item.name, why)) for why in (recorded or reason,) if why

@@ -6,104 +6,21 @@ from the contents of its inputs.
 """
 
 import dataclasses
-import errno
-import importlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from types import ModuleType
-from typing import Any
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-from jaxba.engine._key import Key
+from jaxba.engine._parameters import Parameters
+from jaxba.engine._stage import Item, Pipeline, Stage
 from jaxba.engine._store import load
+from jaxba.engine._work import Work
+from jaxba.engine._workers import Resources
 from jaxba.pipeline import adjust, control, crs, export, features, match, metadata, pairs, start, tracks
-from jaxba.pipeline._detected import Detected
+from jaxba.pipeline._done import Done, made
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
-from jaxba.pipeline._pair_record import PairRecord
-from jaxba.pipeline._routing import Routing, route
-from jaxba.scene import Left, PhotoFile, Reference, ViewGraph
-
-
-@dataclass
-class Done:
-    """What the stages so far have made; None where a stage has not run. `settings`: parameters by stage."""
-
-    files: tuple[PhotoFile, ...]
-    settings: Mapping[str, Any]
-    geotags: tuple[str, str] | None = None
-    gcp: tuple[str, str] | None = None
-    check: tuple[str, str] | None = None
-    metadata: Any = None
-    crs: Any = None
-    control: Any = None
-    pairs: Any = None
-    features: Any = None
-    features_left_out: tuple[Left, ...] = ()
-    match: Any = None
-    match_left_out: tuple[Left, ...] = ()
-    tracks: Any = None
-    start: Any = None
-    adjust: Any = None
-    export: Any = None
-
-    @property
-    def photos(self) -> Any:
-        return self.metadata.photos
-
-    @property
-    def placed(self) -> Reference:
-        """The reference without the target CRS: nothing before the export depends on it."""
-        frame = self.control.reference.frame
-        if frame is None:
-            return self.control.reference
-        frame = dataclasses.replace(
-            frame, crs="", epsg=None, crs_name="", unit="", height_note="", height_datum="", height_unit=""
-        )
-        return dataclasses.replace(self.control.reference, frame=frame, review=(), notes=())
-
-    @property
-    def routing(self) -> Routing:
-        """The detector of the block, and the figures behind it."""
-        params, found = self.settings["features"], self.pairs
-        return route(
-            self.photos,
-            self.crs.reference,
-            found.pairs,
-            found.overlap,
-            detector=params.detector,
-            sift_gsd_m=params.sift_gsd,
-            sift_overlap=params.sift_overlap,
-        )
-
-
-@dataclass(frozen=True)
-class PhotoItem:
-    """The inputs of one photo, what of them counts, by name, the photo's size, and how many others go with it."""
-
-    name: str
-    inputs: Any
-    identity: dict[str, Any]
-    megapixels: float
-    partners: int = 0
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A stage and how it is fed.
-
-    - `inputs`: from what is done. `collect`: for a stage that runs once a photo, from its items' folders.
-    - `useless`: photos of which such a stage made something that nothing can be done with.
-    """
-
-    module: ModuleType
-    inputs: Callable[[Done], Any]
-    collect: Callable[[Done, dict[int, Any], dict[int, str]], Any] | None = None
-    useless: Callable[[Done, Any], tuple[Left, ...]] = lambda done, outputs: ()
-
-    @property
-    def name(self) -> str:
-        return self.module.__name__.rpartition(".")[2]
+from jaxba.pipeline._settings import sections
+from jaxba.scene import Left, PairRecord, Reference, ViewGraph
 
 
 def _metadata(done: Done) -> metadata.Inputs:
@@ -118,8 +35,8 @@ def _crs(done: Done) -> crs.Inputs:
 def _control(done: Done) -> control.Inputs:
     return control.Inputs(
         photos=done.photos,
-        reference=done.crs.reference,
-        target_crs=done.crs.target_crs,
+        reference=made(done.crs).reference,
+        target_crs=made(done.crs).target_crs,
         gcp=done.gcp,
         check=done.check,
     )
@@ -129,7 +46,7 @@ def _pairs(done: Done) -> pairs.Inputs:
     return pairs.Inputs(photos=done.photos, reference=done.placed)
 
 
-def _features(done: Done) -> list[PhotoItem]:
+def _features(done: Done) -> list[Item]:
     """Each photo with what was decided for the block; the figures behind it may change as long as it stays."""
     routing = done.routing
     items = []
@@ -144,47 +61,58 @@ def _features(done: Done) -> list[PhotoItem]:
             "detector": inputs.detector,
             "varying height": inputs.is_height_varying,
         }
-        items.append(PhotoItem(photo.name, inputs, identity, photo.megapixels))
+        items.append(Item(photo.name, inputs, identity, photo.megapixels))
     return items
 
 
-def _features_collected(done: Done, folders: dict[int, Any], digests: dict[int, str]) -> Detected:
-    return Detected(folders, digests, done.routing)
+def _features_collected(done: Done, folders: dict[int, Path], digests: dict[int, str]) -> features.Detected:
+    return features.Detected(folders, digests, done.routing)
 
 
-def _without_keypoints(done: Done, found: Detected) -> tuple[Left, ...]:
-    empty = {index: features for index in sorted(found) if (features := found[index]).num_keypoints == 0}
+def _features_fit(folder: Path, items: Sequence[Work], params: features.Params, resources: Resources) -> None:
+    features.check_store(folder, len(items), items[0].inputs.detector, params, resources)
+
+
+def _features_left_out(done: Done) -> tuple[Left, ...]:
+    found = () if done.match is None else done.match.fallback
+    matched = {done.photos[entry.image].name for entry in found}  # SIFT found some after all
+    return tuple(entry for entry in done.features_left_out if entry.name not in matched)
+
+
+def _without_keypoints(done: Done, found: features.Detected) -> tuple[Left, ...]:
+    empty = {index: entry for index in sorted(found) if (entry := found[index]).num_keypoints == 0}
     return tuple(Left(name=done.photos[i].name, reason="; ".join(f.notes) + ".") for i, f in empty.items())
 
 
 def _partners(done: Done, image: int) -> np.ndarray:
     """Return the rows of the candidate pairs that a photo is matched in: its partners come after it."""
-    described = np.array(sorted(done.features), dtype=int)
-    first, second = done.pairs.pairs[:, 0], done.pairs.pairs[:, 1]
+    described = np.array(sorted(made(done.features)), dtype=int)
+    first, second = made(done.pairs).pairs.T
     return np.flatnonzero((first == image) & np.isin(second, described) & np.isin(first, described))
 
 
-def _match(done: Done) -> list[PhotoItem]:
+def _match(done: Done) -> list[Item]:
     """Each photo with its partners alone, counted from 0, placed from the photo: no other photo changes any of it.
 
     Rounded, since a photo more or less may move the origin of heights: 0.1 mm and a thousandth of the overlap.
     Heights above ground, the files and their size count where ORB may fall back to SIFT, and nowhere else.
     """
     items, reference = [], done.placed
-    is_orb = any(done.features[index].detector == "orb" for index in list(done.features)[:1])  # all are of one kind
+    found, candidates = made(done.features), made(done.pairs)
+    is_orb = any(found[index].detector == "orb" for index in list(found)[:1])  # all are of one kind
     for image, photo in enumerate(done.photos):
         rows = _partners(done, image)
         if len(rows) == 0:
             continue
-        images = [image, *done.pairs.pairs[rows, 1].tolist()]
+        images = [image, *candidates.pairs[rows, 1].tolist()]
         photos = tuple(done.photos[i] for i in images)
         inputs = match.Inputs(
             image=0,
             partners=np.arange(1, len(images)),
-            overlap=np.round(done.pairs.overlap[rows], 3),
+            overlap=np.round(candidates.overlap[rows], 3),
             photos=photos,
             reference=_reference_of(reference, images, with_heights=is_orb),
-            features=done.features.only(images),
+            features=found.only(images),
         )
         identity = {
             "cameras": [(entry.focal_px, entry.width_px, entry.height_px) for entry in photos],
@@ -196,7 +124,7 @@ def _match(done: Done) -> list[PhotoItem]:
         if np.isfinite(inputs.reference.height_above_ground_m[0]):
             identity["photos"] = [entry.sha256 for entry in photos]
             megapixels = max(entry.megapixels for entry in photos)
-        items.append(PhotoItem(photo.name, inputs, identity, megapixels, len(rows)))
+        items.append(Item(photo.name, inputs, identity, megapixels, len(rows)))
     return items
 
 
@@ -215,12 +143,12 @@ def _reference_of(reference: Reference, images: list[int], *, with_heights: bool
     )
 
 
-def _match_collected(done: Done, folders: dict[int, Any], digests: dict[int, str]) -> match.Outputs:
+def _match_collected(done: Done, folders: dict[int, Path], digests: dict[int, str]) -> match.Outputs:
     graphs, records = [], []
     fallback: dict[int, FallbackKeypoints] = {}
     for image in sorted(folders):
         part = load(folders[image], match.Outputs)
-        pairs = done.pairs.pairs[_partners(done, image)]
+        pairs = made(done.pairs).pairs[_partners(done, image)]
         graphs.append(dataclasses.replace(part.view_graph, pairs=np.ascontiguousarray(pairs)))
         images = [image, *pairs[:, 1].tolist()]
         for entry in part.fallback:  # the same of an image, whichever photo it was matched with
@@ -232,17 +160,18 @@ def _match_collected(done: Done, folders: dict[int, Any], digests: dict[int, str
 
 
 def _tracks(done: Done) -> tracks.Inputs:
-    found = WithFallback(done.features, done.match.fallback) if done.match.fallback else done.features
-    return tracks.Inputs(photos=done.photos, features=found, view_graph=done.match.view_graph)
+    found, matched = made(done.features), made(done.match)
+    described = WithFallback(found, matched.fallback) if matched.fallback else found
+    return tracks.Inputs(photos=done.photos, features=described, view_graph=matched.view_graph)
 
 
 def _start(done: Done) -> start.Inputs:
     return start.Inputs(
         photos=done.photos,
         reference=done.placed,
-        view_graph=done.match.view_graph,
-        tracks=done.tracks.tracks,
-        control=done.control.control.without_check_points(),
+        view_graph=made(done.match).view_graph,
+        tracks=made(done.tracks).tracks,
+        control=made(done.control).control.without_check_points(),
     )
 
 
@@ -250,49 +179,37 @@ def _adjust(done: Done) -> adjust.Inputs:
     return adjust.Inputs(
         photos=done.photos,
         reference=done.placed,
-        view_graph=done.match.view_graph,
-        tracks=done.tracks.tracks,
-        block=done.start.block,
-        features=done.features,
-        control=done.control.control,
+        view_graph=made(done.match).view_graph,
+        tracks=made(done.tracks).tracks,
+        block=made(done.start).block,
+        features=made(done.features),
+        control=made(done.control).control,
     )
 
 
 def _export(done: Done) -> export.Inputs:
-    made = done.control
-    return export.Inputs(photos=done.photos, reference=made.reference, adjusted=done.adjust, control=made.control)
+    placed = made(done.control)
+    return export.Inputs(
+        photos=done.photos, reference=placed.reference, adjusted=made(done.adjust), control=placed.control
+    )
 
 
 STAGES = (
-    Stage(metadata, _metadata),
+    Stage(metadata, _metadata, left_out=lambda done: done.metadata.left_out, reads_places=True, reads_given=True),
     Stage(crs, _crs),
-    Stage(control, _control),
+    Stage(control, _control, reads_given=True),
     Stage(pairs, _pairs),
-    Stage(features, _features, _features_collected, _without_keypoints),
-    Stage(match, _match, _match_collected),
+    Stage(features, _features, _features_collected, _features_left_out, _without_keypoints, _features_fit),
+    Stage(match, _match, _match_collected, lambda done: done.match_left_out),
     Stage(tracks, _tracks),
-    Stage(start, _start),
-    Stage(adjust, _adjust),
-    Stage(export, _export),
+    Stage(start, _start, left_out=lambda done: done.start.block.unregistered),
+    Stage(adjust, _adjust, left_out=lambda done: done.adjust.block.unregistered),
+    Stage(export, _export, writes_files=True),
 )
 NAMES = tuple(stage.name for stage in STAGES)
+PIPELINE = Pipeline(STAGES, sections({stage.name: stage.module.Params() for stage in STAGES}), Done)
 
 
-def run_photo(module: str, folder: Any, inputs: Any, params: Any, key: Key) -> str | None:
-    """Run a stage for one photo in a worker and save what it makes; return why it could not, or None."""
-    from jaxba._errors import JaxbaError
-    from jaxba.engine._store import save, save_failure
-
-    stage = importlib.import_module(module)
-    try:
-        outputs = stage.run(inputs, params)
-    except JaxbaError as error:
-        system = error.__cause__ or error.__context__
-        number = system.errno if isinstance(system, OSError) else None
-        if number == errno.ENOMEM:
-            raise MemoryError from error
-        if number is None:  # else it is not the photo's fault but the machine's, and may go well another time
-            save_failure(folder, str(error), key)
-        return str(error)
-    save(folder, outputs, key)
-    return None
+def default_settings() -> dict[str, Parameters]:
+    """Return the defaults of every section, to be changed and handed to a run."""
+    return dict(PIPELINE.settings)

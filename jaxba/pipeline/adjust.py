@@ -3,11 +3,14 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.engine._parameters import Parameters, parameter
+from jaxba.engine._words import many
+from jaxba.report import Told, control_facts, grouped
 from jaxba.scene import Block, Control, ControlFit, Features, Left, Photo, Reference, Tracks, ViewGraph
 
 
@@ -162,3 +165,34 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         mark_used=adjusted.mark_used,
         affine=controlled.affine,
     )
+
+
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made, in words."""
+    return [f"median {outputs.median_px:.2f} px, {many(outputs.rounds, 'round')}", *grouped(told.left_out)]
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return the figures of the adjustment, its findings, and how it fits control."""
+    block = outputs.block
+    seen = np.bincount(block.observation_point, minlength=block.num_points)
+    cameras = zip(block.camera_names, block.camera_parameters, outputs.intrinsics_std, strict=True)
+    adjusted = {
+        "photos": len(told.photos),
+        "images": block.num_images,
+        "points": block.num_points,
+        "points_seen_thrice": int((seen >= 3).sum()),
+        "observations": block.num_observations,
+        "median_px": outputs.median_px,
+        "inlier_rate": outputs.inlier_rate,
+        "gnss_rms_m": None if outputs.gnss_rms_m is None else list(outputs.gnss_rms_m),
+        "num_gnss": outputs.num_gnss,
+        "camera_model": block.camera_model,
+        "cameras": {
+            name: {"parameters": list(map(float, row)), "std": list(map(float, std))} for name, row, std in cameras
+        },
+        "findings": list(outputs.findings),
+    }
+    if not told.control.num_points:
+        return {"adjust": adjusted}
+    return {"adjust": adjusted, "control": control_facts(told.control, outputs.control)}

@@ -11,6 +11,7 @@ another is given. Without a list the reference passes through.
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.io import ControlList, SurveyedPoint, parse_control
 from jaxba.pipeline._marks import marks_in_photos
+from jaxba.report import Told, control_facts, control_lines, reference_facts
 from jaxba.scene import Control, Left, LocalFrame, Photo, Reference
 
 _PLACE = ("crs", "x", "y", "z_m")
@@ -140,6 +142,21 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     left = [*found.left_out, *_weak(control)]
     _refuse_too_few(control, params.method, names)
     return Outputs(reference=reference, control=control, left_out=tuple(left), notes=tuple(notes))
+
+
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made, in words."""
+    return control_lines(outputs.control, outputs.notes, outputs.left_out)
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return the CRS, which control may have placed, and the points with what of the lists cannot be used."""
+    found = reference_facts(outputs.reference)
+    if outputs.control.num_points:
+        left = [{"name": entry.name, "reason": entry.reason} for entry in outputs.left_out]
+        points = control_facts(outputs.control)
+        found["control"] = {"asked_method": outputs.control.method, "left_out": left, **points}
+    return found
 
 
 def _all_points(inputs: Inputs, params: Params) -> tuple[list[SurveyedPoint], list[str]]:

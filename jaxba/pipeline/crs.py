@@ -1,11 +1,13 @@
 """Stage crs: the target CRS, positions and attitudes in the local frame, and which positions are trusted."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
+from jaxba.report import Told, grouped, reference_facts
 from jaxba.scene import Left, Photo, Reference
 
 
@@ -117,6 +119,19 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         ),
     )
     return Outputs(reference=reference, target_crs=params.target_crs)
+
+
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made, in words."""
+    reference = outputs.reference
+    where = reference.frame.crs_name if reference.frame is not None else "no place on earth"
+    first = f"{where}; {int(reference.is_used.sum())} of {len(reference.is_used)} positions used"
+    return [first, *reference.notes, *grouped(reference.review)]
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return the CRS, what heights are above, and the positions on review."""
+    return reference_facts(outputs.reference)
 
 
 def _stop_if_too_few(is_used: np.ndarray, counts: dict[str, int], review: tuple[Left, ...], params: Params) -> None:

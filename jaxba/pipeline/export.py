@@ -14,7 +14,9 @@ from jaxtyping import Float, Int
 
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._store import sha256
+from jaxba.engine._words import many
 from jaxba.pipeline import adjust
+from jaxba.report import Told
 from jaxba.scene import Block, Control, LocalFrame, Photo, Reference
 
 
@@ -83,6 +85,16 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     _write(folder / "README.txt", _readme(notes).encode())
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return Outputs(files=tuple(files), sha256=tuple(sha256(folder / name) for name in files), notes=tuple(notes))
+
+
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made, in words."""
+    return [many(len(outputs.files), "file"), *outputs.notes]
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return the files and what a reader of them should know."""
+    return {"export": {"files": list(outputs.files), "notes": list(outputs.notes)}}
 
 
 def _mapped(inputs: Inputs, xyz_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -1,12 +1,33 @@
 """Stage features: keypoints and descriptors of one photo; the runner calls it once a photo, in worker processes."""
 
-from dataclasses import dataclass
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from jaxba._errors import JaxbaError
+from jaxba.engine import Resources
+from jaxba.engine._limits import check_room
 from jaxba.engine._parameters import Parameters, parameter
-from jaxba.pipeline._tuning import CONDITIONS, Tuning, tune
-from jaxba.scene import Features, Photo
-from jaxba.vision import OrbOptions, Pixels, decode, detect_features, measure_image
+from jaxba.engine._store import Stored
+from jaxba.pipeline._routing import Routing
+from jaxba.report import Told, grouped, with_ranges
+from jaxba.scene import Features, Left, Photo
+from jaxba.vision import (
+    CONDITIONS,
+    OrbOptions,
+    Pixels,
+    Tuning,
+    decode,
+    detect_features,
+    measure_image,
+    most_keypoints,
+    store_bytes,
+    tune,
+)
 
 _CONTRAST_FLOOR = 0.02
 
@@ -77,6 +98,40 @@ class Outputs:
     tuning: Tuning
 
 
+class Detected(Mapping[int, Features]):
+    """What the stage found of all photos: features by image index, opened on access, and how each was looked at.
+
+    - `routing`: of the block; it does not count for a fingerprint.
+    """
+
+    def __init__(self, folders: Mapping[int, Path], digests: Mapping[int, str], routing: Routing) -> None:
+        self.features: Stored[Features] = Stored(Outputs, "features", folders, digests)
+        self.routing = routing
+
+    @functools.cached_property
+    def tunings(self) -> Mapping[int, Tuning]:
+        """How each photo was looked at."""
+        return dict(Stored(Outputs, "tuning", self.features.folders, self.features.digests))
+
+    @property
+    def digests(self) -> Mapping[int, str]:
+        """What counts for a fingerprint."""
+        return self.features.digests
+
+    def only(self, indices: Sequence[int]) -> Stored[Features]:
+        """Return the features of some photos, counted anew from 0 in the order given."""
+        return self.features.only(indices)
+
+    def __getitem__(self, index: int) -> Features:
+        return self.features[index]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.features)
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+
 def run(inputs: Inputs, params: Params) -> Outputs:
     """Detect and describe the features of one photo.
 
@@ -104,6 +159,39 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         nlevels=params.nlevels,
     )
     return Outputs(features=_detect(pixels, tuning, params), tuning=tuning)
+
+
+def check_store(store: Path, num_photos: int, detector: str, params: Params, resources: Resources) -> None:
+    """Raise `JaxbaError` where the features of so many photos may not fit, or may take more than is allowed.
+
+    - `store`: the folder where they are to lie. `detector`: of all photos.
+    """
+    nfeatures = most_keypoints(detector, params.nfeatures)
+    check_room(
+        store,
+        store_bytes(num_photos, detector, nfeatures),
+        resources,
+        what=f"the features of {num_photos:,} photos",
+        each=f"at {nfeatures:,} keypoints a photo",
+        cure="Set fewer features.nfeatures, take fewer photos",
+    )
+
+
+def lines(outputs: Detected, told: Told) -> list[str]:
+    """Return what was made of all photos, in words."""
+    found = {index: outputs[index] for index in sorted(outputs)}
+    counts = [features.num_keypoints for features in found.values()]
+    first = f"{sum(counts):,} keypoints, median {int(np.median(counts)):,} an image" if counts else "no keypoints"
+    used = [i for i, features in found.items() if features.num_keypoints]
+    texts = [(i, text) for i in used for text in (*outputs.tunings[i].reasons, *found[i].notes)]
+    odd = [Left(name=told.photos[i], reason=text) for i, text in texts]
+    return [first, *outputs.routing.reasons, *grouped(told.left_out), *grouped(with_ranges(odd))]
+
+
+def facts(outputs: Detected, told: Told) -> dict[str, Any]:
+    """Return the decision on the detector with its figures, and how each photo was looked at, with those of its own."""
+    photos = {told.photos[i]: asdict(outputs.tunings[i]) for i in sorted(outputs)}
+    return {"features": {"routing": asdict(outputs.routing), "photos": photos}}
 
 
 def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.pipeline._fallback import FallbackKeypoints, detect_fallback
-from jaxba.pipeline._pair_record import Fallback, Missed, Model, PairRecord
-from jaxba.scene import EdgeStatus, Features, Photo, Reference, ViewGraph
+from jaxba.report import Told, grouped, pair_facts, pair_lines
+from jaxba.scene import EdgeStatus, Fallback, Features, Missed, Model, PairRecord, Photo, Reference, ViewGraph
 from jaxba.vision import (
     Descriptors,
     Pinhole,
@@ -126,6 +127,20 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         record=PairRecord.concatenate(records),
         fallback=tuple(fallback.values()),
     )
+
+
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made of all photos, in words."""
+    graph = outputs.view_graph
+    good, weak = (int((graph.status == status).sum()) for status in (EdgeStatus.GOOD, EdgeStatus.WEAK))
+    rejected = len(graph.pairs) - good - weak
+    first = f"{good:,} good pairs, {weak:,} weak, {rejected:,} rejected; {len(graph.matches):,} matches"
+    return [first, *pair_lines(graph, outputs.record), *grouped(told.left_out)]
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return how many pairs got which threshold and model, missed which figure, and fell back or why not."""
+    return {"match": pair_facts(outputs.view_graph, outputs.record)}
 
 
 def _sift(inputs: Inputs, image: int, params: Params) -> Features:

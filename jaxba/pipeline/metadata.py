@@ -9,11 +9,13 @@ import dataclasses
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import PurePosixPath
+from typing import Any
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
-from jaxba.engine._words import some_photos
+from jaxba.engine._words import many, some_photos
 from jaxba.io import Geotag, match_geotags, parse_geotags
+from jaxba.report import Told, grouped
 from jaxba.scene import Attitude, Left, Photo, PhotoFile
 from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
 
@@ -84,6 +86,19 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         notes += found
     left_out.sort(key=lambda left: left.name)
     return Outputs(photos=tuple(photos), left_out=tuple(left_out), notes=tuple(notes))
+
+
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made, in words."""
+    cameras = len({photo.camera for photo in outputs.photos})
+    left = f", {many(len(told.left_out), 'file')} left out" if told.left_out else ""
+    first = f"{many(len(outputs.photos), 'photo')}, {many(cameras, 'camera')}{left}"
+    return [first, *outputs.notes, *grouped(told.left_out)]
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return nothing of its own: what is left out stands in the summary for all stages."""
+    return {}
 
 
 _RAW_CURE = "is a RAW or HEIC file, which is not read; develop or convert it to JPEG or TIFF with its tags."

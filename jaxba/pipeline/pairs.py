@@ -11,12 +11,14 @@ by 1 degree 0 to 2 of some 7,500 are missed; with 1.5 m and 1.5 degrees 4 to 9, 
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
+from jaxba.report import Told
 from jaxba.scene import (
     Footprints,
     Photo,
@@ -119,6 +121,21 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     return Outputs(
         pairs=pairs.astype(np.int32), overlap=overlap, method=method, num_all=num_all, notes=tuple(notes)
     )  # fmt: skip
+
+
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made, in words."""
+    share = f" ({len(outputs.pairs) / outputs.num_all:.0%})" if outputs.num_all else ""
+    first = f"{len(outputs.pairs):,} of {outputs.num_all:,} pairs{share}, {outputs.method}"
+    notes = list(outputs.notes)
+    if notes and notes[0].startswith(f"{len(outputs.pairs):,} of {outputs.num_all:,} pairs"):
+        first = notes.pop(0).removesuffix(".")
+    return [first, *notes]
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return how many pairs there are to match, of how many, and how they were found."""
+    return {"pairs": {"candidates": len(outputs.pairs), "all": outputs.num_all, "method": outputs.method}}
 
 
 def _method(is_placed: Bool[np.ndarray, " photos"], reference: Reference, params: Params) -> str:

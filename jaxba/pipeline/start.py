@@ -1,10 +1,13 @@
 """Stage start: start values of poses, cameras and points."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from jaxba.engine._parameters import Parameters, parameter
+from jaxba.engine._words import many
+from jaxba.report import Told, grouped
 from jaxba.scene import Block, Control, Photo, Reference, Tracks, ViewGraph
 
 
@@ -51,3 +54,15 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         min_angle_rad=float(np.deg2rad(params.min_angle)),
     )
     return Outputs(block=place_by_control(block, inputs.control))
+
+
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made, in words."""
+    block = outputs.block
+    first = f"{many(block.num_images, 'image')}, {block.num_points:,} points"
+    return [first, *block.notes, *grouped(told.left_out)]
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return nothing of its own: start values are not a result."""
+    return {}

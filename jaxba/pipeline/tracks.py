@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Int
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
-from jaxba.engine._words import some
-from jaxba.scene import Features, Photo, Tracks, ViewGraph, build_tracks
+from jaxba.engine._words import many, some
+from jaxba.report import Told
+from jaxba.scene import Features, Photo, Tracks, ViewGraph, build_tracks, pairs_between
 
 _NAMED = 5  # images and pairs of each group that a message names
 
@@ -63,12 +64,18 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     return Outputs(tracks=tracks, notes=tuple(notes))
 
 
-def pairs_between(groups: Sequence[tuple[int, ...]], graph: ViewGraph) -> Int[np.ndarray, " pairs"]:
-    """Return the rows of the candidate pairs that would join groups of images, those with the most matches first."""
-    label = {image: number for number, group in enumerate(groups) for image in group}
-    ends = np.array([(label.get(i, -1), label.get(j, -1)) for i, j in graph.pairs.tolist()], int).reshape(-1, 2)
-    between = np.flatnonzero((ends[:, 0] != ends[:, 1]) & (ends >= 0).all(axis=1))
-    return between[np.argsort(-graph.num_putative[between], kind="stable")]
+def lines(outputs: Outputs, told: Told) -> list[str]:
+    """Return what was made, in words."""
+    tracks = outputs.tracks
+    largest = f"{len(tracks.components[0])} of {many(len(told.photos), 'photo')} in the largest group"
+    first = f"{tracks.num_tracks:,} tracks, {tracks.num_observations:,} observations; {largest}"
+    return [first, *outputs.notes]
+
+
+def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
+    """Return the photos of each group without common tracks, where there is more than one, the largest first."""
+    groups = outputs.tracks.components
+    return {"groups": [[told.photos[image] for image in group] for group in groups]} if len(groups) > 1 else {}
 
 
 def _has_keypoints(inputs: Inputs, image: int) -> bool:

@@ -1,5 +1,10 @@
 from . import diagnosis as diagnosis, verification as verification
+from ._control import control_facts as control_facts, control_lines as control_lines, control_rows as control_rows
+from ._pairs import pair_facts as pair_facts, pair_lines as pair_lines
 from ._picture import Picture as Picture, draw_picture as draw_picture
+from ._reasons import grouped as grouped, with_ranges as with_ranges
 from ._recorded import Recorded as Recorded, recorded as recorded
+from ._reference import reference_facts as reference_facts
 from ._status import Status as Status, project_settings as project_settings, status as status
-from ._summary import stage_lines as stage_lines, summary as summary
+from ._summary import summary as summary, told_of as told_of
+from ._told import Told as Told

@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jaxba.engine import _store
 from jaxba.engine._lock import holder
 from jaxba.engine._project import SETTINGS, SUMMARY, Project, read_lists
-from jaxba.pipeline._settings import default_settings, from_toml
-from jaxba.pipeline._stages import STAGES, Done
-from jaxba.pipeline._work import collected, works
+from jaxba.engine._settings import from_toml
+from jaxba.engine._stage import Pipeline
+from jaxba.engine._work import collected, works
 from jaxba.report._summary import left_out_by_last_run
 from jaxba.scene import Left
-
-_OF_FILES = ("metadata", "control")  # their inputs are photos and lists, which may have moved since
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +26,7 @@ class Recorded:
     - `failed`: photos of which a stage could make nothing, by stage: also those whose worker died.
     """
 
-    done: Done
+    done: Any
     stopped: Left | None
     killed: str | None
     running: str | None
@@ -35,7 +34,7 @@ class Recorded:
     failed: dict[str, tuple[Left, ...]]
 
 
-def recorded(folder: Path) -> Recorded:
+def recorded(folder: Path, pipeline: Pipeline) -> Recorded:
     """Return what the stages of a project have recorded under its last run's settings.
 
     Records of earlier runs, made from other inputs or parameters, are passed over, and all that would follow them.
@@ -43,29 +42,29 @@ def recorded(folder: Path) -> Recorded:
     Raises `JaxbaError` where the folder is no project, or a list that the run was given cannot be read any more.
     """
     project = Project(folder, make=False)
-    settings = from_toml(project.folder / SETTINGS, default_settings())
+    settings = from_toml(project.folder / SETTINGS, pipeline.settings)
     given, stage_now = project.read_given()
     running = holder(project.folder)
-    done = Done(files=(), settings=settings, **read_lists(given))
+    done = pipeline.begin(files=(), settings=settings, **read_lists(given))
     failed: dict[str, tuple[Left, ...]] = {}
     stale = None
     summary = project.read_json(SUMMARY)
     ended = summary if isinstance(summary, dict) and stage_now is None else {}
     stopped = ended.get("stopped")
     last = stopped["stage"] if isinstance(stopped, dict) else stage_now
-    for stage in STAGES:
-        if stage.name in _OF_FILES:
+    for stage in pipeline.stages:
+        if stage.reads_given:
             if stage.name == last or _store.read_record(project.stage(stage.name)) is None:
                 break
             setattr(done, stage.name, _store.load(project.stage(stage.name), stage.module.Outputs))
             continue
         items = [item for item in works(project, stage, done, settings[stage.name]) if item.record is not None]
         if not items:
-            stale = stage.name if stage.name != "export" and project.stage(stage.name).exists() else None
+            stale = stage.name if not stage.writes_files and project.stage(stage.name).exists() else None
             break
         outputs, failed[stage.name] = collected(stage, done, items)
         setattr(done, stage.name, outputs)
-    for name in ("features", "match"):
+    for name in (stage.name for stage in pipeline.stages if stage.is_by_photo):
         known = {left.name for left in failed.get(name, ())}
         others = [left for left in left_out_by_last_run(ended, name) if left.name not in known]
         if others:

@@ -4,17 +4,18 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._lock import holder
+from jaxba.engine._parameters import Parameters
 from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists
-from jaxba.pipeline._settings import Settings, default_settings, from_toml
-from jaxba.pipeline._stages import STAGES, Done, Stage
-from jaxba.pipeline._work import collected, why_to_do, works
-from jaxba.report._summary import left_out, left_out_by_last_run
+from jaxba.engine._settings import Settings, from_toml
+from jaxba.engine._stage import Pipeline, Stage, left_out
+from jaxba.engine._work import collected, why_to_do, works
+from jaxba.report._summary import left_out_by_last_run
 from jaxba.scene import EdgeStatus, Left
 
 State = Literal["done", "stale", "partly done", "not done", "waits"]
@@ -57,42 +58,43 @@ class Status:
         return all(standing.state == "done" for standing in self.stages)
 
 
-def project_settings(folder: Path) -> dict:
+def project_settings(folder: Path, pipeline: Pipeline) -> dict[str, Parameters]:
     """Return the settings of a project's last run."""
-    return from_toml(Project(folder, make=False).folder / SETTINGS, default_settings())
+    return from_toml(Project(folder, make=False).folder / SETTINGS, pipeline.settings)
 
 
-def status(folder: Path, settings: Settings) -> Status:
+def status(folder: Path, pipeline: Pipeline, settings: Settings) -> Status:
     """Return how a project stands against settings, those of its last run or others.
 
     Raises `JaxbaError` where the folder is no project.
     """
     project = Project(folder, make=False)
     given, stage_now = project.read_given()
-    done: Done | None = None
+    done: Any = None
     stages: list[Standing] = []
     summary = project.read_json(SUMMARY) if stage_now is None else None  # else of the run before
     try:
         files = project.photo_files(given.photos, remember=False)
-        done = Done(files=files, settings=settings, **read_lists(given))
+        done = pipeline.begin(files=files, settings=settings, **read_lists(given))
     except JaxbaError as error:
-        stages.append(Standing(stage=STAGES[0].name, state="stale", num_all=1, reason=str(error)))
-    for stage in STAGES[len(stages) :]:
+        stages.append(Standing(stage=pipeline.stages[0].name, state="stale", num_all=1, reason=str(error)))
+    for stage in pipeline.stages[len(stages) :]:
         if stages and stages[-1].state != "done":
             stages.append(_waiting(project, stage, stages))
             continue
-        assert done is not None
-        died = left_out_by_last_run(summary, stage.name) if stage.collect is not None else ()
+        died = left_out_by_last_run(summary, stage.name) if stage.is_by_photo else ()
         stages.append(_standing(project, stage, done, settings, died))
     return Status(
         stages=tuple(stages),
-        left_out=() if done is None else tuple((s, left) for s, found in left_out(done).items() for left in found),
+        left_out=()
+        if done is None
+        else tuple((s, left) for s, found in left_out(pipeline.stages, done).items() for left in found),
         rejected=() if done is None else _rejected(done),
         activity=_activity(project, given, stage_now),
     )
 
 
-def _standing(project: Project, stage: Stage, done: Done, settings: Settings, died: Sequence[Left]) -> Standing:
+def _standing(project: Project, stage: Stage, done: Any, settings: Settings, died: Sequence[Left]) -> Standing:
     """Return how a stage stands, and note in `done` what it made where it is done.
 
     - `died`: photos that the last run could not use in it; of those without a record the worker died.
@@ -106,7 +108,7 @@ def _standing(project: Project, stage: Stage, done: Done, settings: Settings, di
     if not reasons:
         outputs, unused = collected(stage, done, items)
         setattr(done, stage.name, outputs)
-        if stage.collect is not None:
+        if stage.is_by_photo:
             setattr(done, f"{stage.name}_left_out", (*unused, *lost, *stage.useless(done, outputs)))
         return Standing(stage=stage.name, state="done", num_done=count, num_all=len(items))
     fresh = all(reason == _NOT_DONE for reason in reasons)
@@ -126,7 +128,7 @@ def _waiting(project: Project, stage: Stage, before: Sequence[Standing]) -> Stan
     return Standing(stage=stage.name, state="waits", reason=f"waits for {blocking}; {was}")
 
 
-def _rejected(done: Done) -> tuple[Left, ...]:
+def _rejected(done: Any) -> tuple[Left, ...]:
     if done.match is None:
         return ()
     graph = done.match.view_graph

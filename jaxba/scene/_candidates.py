@@ -1,10 +1,13 @@
 """Candidate pairs from positions or order alone, where footprints are unknown or leave photos on their own."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from jaxba.scene._graph import component_labels
+from jaxba.scene._view_graph import ViewGraph
 
 
 def nearest_pairs(xy_m: Float[np.ndarray, "n 2"], count: int) -> Int[np.ndarray, "pairs 2"]:
@@ -50,6 +53,14 @@ def joining_pairs(
         ends = np.stack(np.broadcast_arrays(group[:, None], rest[nearest.reshape(len(group), -1)]), axis=-1)
         closest = np.argsort(distance.reshape(-1), kind="stable")[:count]
         added = np.concatenate([added, ends.reshape(-1, 2)[closest]])
+
+
+def pairs_between(groups: Sequence[tuple[int, ...]], graph: ViewGraph) -> Int[np.ndarray, " pairs"]:
+    """Return the rows of the candidate pairs that would join groups of images, those with the most matches first."""
+    label = {image: number for number, group in enumerate(groups) for image in group}
+    ends = np.array([(label.get(i, -1), label.get(j, -1)) for i, j in graph.pairs.tolist()], int).reshape(-1, 2)
+    between = np.flatnonzero((ends[:, 0] != ends[:, 1]) & (ends >= 0).all(axis=1))
+    return between[np.argsort(-graph.num_putative[between], kind="stable")]
 
 
 def rising(pairs: Int[np.ndarray, "any 2"]) -> Int[np.ndarray, "pairs 2"]:

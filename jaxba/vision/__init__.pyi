@@ -17,4 +17,11 @@ from ._photo import (
     read_photo as read_photo,
 )
 from ._statistics import ImageStatistics as ImageStatistics, measure_image as measure_image
+from ._tuning import (
+    CONDITIONS as CONDITIONS,
+    Tuning as Tuning,
+    most_keypoints as most_keypoints,
+    store_bytes as store_bytes,
+    tune as tune,
+)
 from ._two_view import Pinhole as Pinhole, PosePrior as PosePrior, TwoView as TwoView, verify as verify

@@ -2,9 +2,9 @@ import psutil
 import pytest
 
 from jaxba import JaxbaError
-from jaxba.engine import Resources, _workers
+from jaxba.engine import Resources, _workers, changed
 from jaxba.engine._workers import bytes_of, machine_memory, memory_for
-from jaxba.pipeline import changed, default_settings
+from jaxba.pipeline import PIPELINE
 
 
 def test_the_number_of_workers_follows_from_megapixels_and_memory():
@@ -30,7 +30,7 @@ def test_amounts_are_shares_or_bytes_as_people_write_them(text, bytes_):
 
 
 def test_the_settings_take_amounts_as_texts():
-    settings = changed(default_settings(), ["workers.max_memory=800MB", "workers.workers=2", "workers.max_store=0.5"])
+    settings = changed(PIPELINE.settings, ["workers.max_memory=800MB", "workers.workers=2", "workers.max_store=0.5"])
     assert settings["workers"] == Resources(max_memory="800MB", workers=2, max_store=0.5)
     assert Resources(max_memory="800MB").memory_bytes == 8e8
     assert Resources(max_memory="0.5").memory_bytes == machine_memory() / 2

@@ -13,8 +13,8 @@ from PIL import Image
 from small_survey import NUM_PHOTOS, Survey
 
 from jaxba import JaxbaError
-from jaxba.pipeline import Run, changed, default_settings
-from jaxba.report import summary
+from jaxba.engine import changed
+from jaxba.pipeline import PIPELINE, Run
 
 SAME_PLACE = ("crs.min_positions=1",)
 
@@ -63,7 +63,7 @@ def mixed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Surve
 def test_nothing_is_dropped_in_silence(mixed: tuple[Survey, Run]):
     survey, run = mixed
     files = {path.relative_to(survey.photos).as_posix() for path in survey.photos.rglob("*") if path.is_file()}
-    facts = summary(run)
+    facts = run.facts
     adjusted = {run.done.photos[i].name for i in run.done.adjust.block.image_index}
     left_out = [entry["name"] for entry in facts["left_out"]]
     assert len(left_out) == len(set(left_out)) and adjusted.isdisjoint(left_out)
@@ -74,7 +74,7 @@ def test_nothing_is_dropped_in_silence(mixed: tuple[Survey, Run]):
 
 def test_each_bad_file_is_named_with_its_reason_and_the_rest_goes_on(mixed: tuple[Survey, Run]):
     _, run = mixed
-    reasons = {entry["name"]: (entry["stage"], entry["reason"]) for entry in summary(run)["left_out"]}
+    reasons = {entry["name"]: (entry["stage"], entry["reason"]) for entry in run.facts["left_out"]}
     expected = {
         "photo 2.JPG": ("metadata", "same file as copy.jpg"),
         "cut.jpg": ("features", "cannot be decoded (image file is truncated"), "black.jpg": ("features", "no texture"),
@@ -89,7 +89,7 @@ def test_each_bad_file_is_named_with_its_reason_and_the_rest_goes_on(mixed: tupl
 
 def test_two_cameras_are_allowed_and_said(mixed: tuple[Survey, Run]):
     survey, run = mixed
-    lines = summary(run)["stages"]["metadata"]
+    lines = run.facts["stages"]["metadata"]
     assert lines[0] == "10 photos, 2 cameras, 4 files left out"
     assert any("2 cameras, each with its own intrinsics" in line for line in lines)
     sizes = {photo.camera: (photo.width_px, photo.height_px) for photo in run.done.photos}
@@ -99,7 +99,7 @@ def test_two_cameras_are_allowed_and_said(mixed: tuple[Survey, Run]):
 
 def test_photos_without_features_are_groups_of_their_own_by_name(mixed: tuple[Survey, Run]):
     _, run = mixed
-    groups = summary(run)["groups"]
+    groups = run.facts["groups"]
     assert len(groups[0]) == NUM_PHOTOS and sorted(groups[1:]) == [["black.jpg"], ["cut.jpg"]]
 
 
@@ -154,7 +154,7 @@ def test_a_target_crs_that_cannot_be_meant_is_refused(made: Survey, tmp_path: Pa
 
 def test_unknown_parameters_are_refused_with_the_known_ones():
     with pytest.raises(JaxbaError, match=r"match\.rato; did you mean ratio\? the parameters of match are ratio"):
-        changed(default_settings(), ["match.rato=0.7"])
+        changed(PIPELINE.settings, ["match.rato=0.7"])
 
 
 def test_an_out_folder_that_cannot_be_made_is_refused(photos: Path, tmp_path: Path):
@@ -219,7 +219,7 @@ def test_awkward_files_among_photos_are_read_or_named(data_dir: Path, tmp_path: 
     survey = Survey(data_dir / "exif", tmp_path / "project")
     files = {path.name for path in survey.photos.iterdir()}
     run = survey.run(*SAME_PLACE, until="features")
-    facts = summary(run)
+    facts = run.facts
     used = {run.done.photos[i].name for i in run.done.features}
     left_out = {entry["name"] for entry in facts["left_out"]}
     assert used | left_out == files and len(files) == 11

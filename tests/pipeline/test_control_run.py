@@ -9,9 +9,9 @@ from small_survey import Survey
 
 from jaxba._errors import JaxbaError
 from jaxba.io import read_tile
+from jaxba.pipeline import PIPELINE
 from jaxba.pipeline._events import Run
-from jaxba.report import summary
-from jaxba.report._control_summary import control_rows
+from jaxba.report import control_rows
 from jaxba.report.verification import Params, verify
 
 
@@ -50,7 +50,7 @@ def test_points_lie_where_the_truth_has_them(run: Run, survey: Survey) -> None:
 
 
 def test_summary_and_terminal_tell_control_and_check_apart(run: Run) -> None:
-    facts = summary(run)["control"]
+    facts = run.facts["control"]
     assert facts["method"] == "adjust" and facts["control"]["num"] == facts["check"]["num"] == 5
     assert {point["role"] for point in facts["points"]} == {"control", "check"}
     # positions of 3 and 5 cm agree with control, and hold the block with it
@@ -59,7 +59,7 @@ def test_summary_and_terminal_tell_control_and_check_apart(run: Run) -> None:
     assert (first, second) == ("control", "check")
     assert control.startswith("RMS 0.0") and "m east, north, up over 5 points; worst gcp" in control
     assert "worst check" in check
-    assert not [text for text in summary(run)["adjust"]["findings"] if "ontrol" in text and "contradict" in text]
+    assert not [text for text in run.facts["adjust"]["findings"] if "ontrol" in text and "contradict" in text]
 
 
 def test_tile_holds_the_control_points_with_their_marks(run: Run, survey: Survey) -> None:
@@ -79,7 +79,7 @@ def test_verification_passes_with_control_in_the_adjustment_and_fitted_afterward
     run: Run, survey: Survey, tmp_path: Path
 ) -> None:
     def failed(of: Survey) -> list[str]:
-        return [check.text for check in verify(of.project, Params()) if check.state == "FAIL"]
+        return [check.text for check in verify(of.project, PIPELINE, Params()) if check.state == "FAIL"]
 
     assert failed(survey) == []
     lists = survey.photos.parent

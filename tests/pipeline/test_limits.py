@@ -12,11 +12,13 @@ from small_survey import NUM_PHOTOS, Survey
 from jaxba import JaxbaError
 from jaxba.engine import Resources
 from jaxba.engine._key import Key
+from jaxba.engine._limits import check_failures
 from jaxba.engine._store import read_record
+from jaxba.engine._work import run_one
 from jaxba.pipeline import Event, features
-from jaxba.pipeline._limits import check_failures, check_store, store_bytes
-from jaxba.pipeline._stages import run_photo
+from jaxba.pipeline.features import check_store
 from jaxba.scene import Left, Photo
+from jaxba.vision import store_bytes
 
 
 @pytest.fixture
@@ -82,7 +84,7 @@ def test_a_bad_photo_is_not_tried_again_and_a_photo_that_could_not_be_read_is(
     spoil(path)
     params = features.Params(nfeatures=2000)
     inputs = features.Inputs(photo=dataclasses.replace(photo, path=path))
-    reason = run_photo(features.__name__, tmp_path / "out", inputs, params, Key.of(features.__name__, params, {}))
+    reason = run_one(features.__name__, tmp_path / "out", inputs, params, Key.of(features.__name__, params, {}))
     record = read_record(tmp_path / "out")
     assert reason is not None and words in reason
     assert (record is not None and record.failed == reason) if is_final else record is None

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxba.pipeline import match
-from jaxba.pipeline._pair_record import Fallback, Missed, Model, pair_facts, pair_lines
-from jaxba.scene import EdgeStatus, Features, Photo, Reference, ViewGraph
+from jaxba.report import pair_facts, pair_lines
+from jaxba.scene import EdgeStatus, Fallback, Features, Missed, Model, Photo, Reference, ViewGraph
 from jaxba.vision import Pixels, TwoView, decode, detect_features
 
 FOCAL_PX = 936.0

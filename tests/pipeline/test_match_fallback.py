@@ -10,10 +10,10 @@ import pytest
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.engine._key import Key
 from jaxba.engine._store import save
-from jaxba.pipeline import _stages, default_settings, match, metadata, pairs, tracks
+from jaxba.pipeline import PIPELINE, _stages, match, metadata, pairs, tracks
 from jaxba.pipeline._fallback import WithFallback, detect_fallback
-from jaxba.pipeline._pair_record import Fallback, Missed, pair_lines
-from jaxba.scene import Block, EdgeStatus, Features, Photo, Reference, Tracks
+from jaxba.report import pair_lines
+from jaxba.scene import Block, EdgeStatus, Fallback, Features, Missed, Photo, Reference, Tracks
 from jaxba.sfm._complete import complete_tracks
 from jaxba.vision import decode, detect_features
 
@@ -170,7 +170,7 @@ def test_tracks_have_the_pixels_of_the_sift_keypoints(
 def test_items_of_photos_are_merged_by_image_of_the_survey(
     photos: tuple[Photo, ...], orb: dict[int, Features], tmp_path: Path
 ) -> None:
-    done = _stages.Done(files=(), settings=default_settings())
+    done = _stages.Done(files=(), settings=PIPELINE.settings)
     done.metadata = metadata.Outputs(photos=photos, left_out=())
     done.features = orb
     done.pairs = pairs.Outputs(

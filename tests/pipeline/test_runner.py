@@ -13,10 +13,9 @@ import pytest
 from small_survey import FAST, NUM_PHOTOS, Survey, repaint
 
 from jaxba import JaxbaError
+from jaxba.engine import changed, from_toml
 from jaxba.engine._fingerprint import fingerprint
-from jaxba.pipeline import NAMES, Event, adjust, changed, default_settings, run_pipeline, start
-from jaxba.pipeline._settings import from_toml
-from jaxba.report import summary
+from jaxba.pipeline import NAMES, PIPELINE, Event, adjust, run_pipeline, start
 
 FIRST, LAST = "SIM_0001.JPG", f"SIM_{NUM_PHOTOS:04d}.JPG"
 
@@ -67,10 +66,11 @@ def test_a_run_adjusts_every_photo_and_says_so(made: Survey):
 QUICK = """
 import sys, time
 from pathlib import Path
-from jaxba.pipeline import changed, default_settings, run_pipeline
+from jaxba.pipeline import PIPELINE, run_pipeline
+from jaxba.engine import changed
 for _ in range(4):  # the first one imports
     begun = time.perf_counter()
-    run_pipeline(Path(sys.argv[1]), Path(sys.argv[2]), changed(default_settings(), sys.argv[3:]))
+    run_pipeline(Path(sys.argv[1]), Path(sys.argv[2]), changed(PIPELINE.settings, sys.argv[3:]))
     print(time.perf_counter() - begun)
 """
 
@@ -113,7 +113,7 @@ def test_another_target_crs_reruns_crs_and_export_alone(made: Survey, tmp_path: 
     before = exported(survey.project)
     run = survey.run("crs.target_crs=EPSG:6344")  # NAD83(2011) / UTM zone 15N
     assert run.stages_run == ("crs", "control", "export")
-    assert summary(run)["crs"]["epsg"] == 6344
+    assert run.facts["crs"]["epsg"] == 6344
     assert exported(survey.project)["cloud.laz"] != before["cloud.laz"]
 
 
@@ -236,11 +236,11 @@ def test_an_export_folder_that_was_removed_is_written_again(made: Survey, tmp_pa
 
 
 def test_parameters_of_the_last_run_lie_in_the_project(made: Survey):
-    assert from_toml(made.project / "jaxba.toml", default_settings()) == changed(
-        default_settings(), [*FAST, "workers.workers=2"]
+    assert from_toml(made.project / "jaxba.toml", PIPELINE.settings) == changed(
+        PIPELINE.settings, [*FAST, "workers.workers=2"]
     )
 
 
 def test_a_project_folder_is_not_the_photo_folder(photos: Path):
     with pytest.raises(JaxbaError, match="is the folder of the photos; choose another folder for --out"):
-        run_pipeline(photos, photos, default_settings())
+        run_pipeline(photos, photos, PIPELINE.settings)

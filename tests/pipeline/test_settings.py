@@ -4,9 +4,9 @@ from typing import get_args, get_type_hints
 import pytest
 
 from jaxba import JaxbaError
+from jaxba.engine import changed, explained, from_toml, to_toml
 from jaxba.engine._parameters import Parameters, allowed, parameter
-from jaxba.pipeline import STAGES, changed, default_settings
-from jaxba.pipeline._settings import explained, from_toml, to_toml
+from jaxba.pipeline import PIPELINE, STAGES
 
 EVERY = [(stage, field) for stage in STAGES for field in dataclasses.fields(stage.module.Params)]
 
@@ -26,7 +26,7 @@ def test_every_parameter_has_a_meaning_and_a_default_in_its_range(stage, field):
     ("text", "value"), [("match.ratio=0.7", 0.7), ("match.min_inliers=20", 20), ("crs.target_crs=EPSG:32615", None)]
 )
 def test_a_change_changes_that_parameter_alone(text, value):
-    before, after = default_settings(), changed(default_settings(), [text])
+    before, after = PIPELINE.settings, changed(PIPELINE.settings, [text])
     stage, name = text.split("=")[0].split(".")
     assert getattr(after[stage], name) == (value or "EPSG:32615")
     assert {s for s in before if before[s] != after[s]} == {stage}
@@ -54,19 +54,19 @@ def test_a_change_changes_that_parameter_alone(text, value):
 )
 def test_a_bad_change_says_what_is_allowed(text, message):
     with pytest.raises(JaxbaError, match=message):
-        changed(default_settings(), [text])
+        changed(PIPELINE.settings, [text])
 
 
 @pytest.mark.parametrize("text", ["tiles.chunk_size=200", "tiles.overlap=40"])
 def test_what_would_have_no_effect_is_refused(text):
     with pytest.raises(JaxbaError, match=rf"{text}: blocks are solved whole so far, whatever their size; leave"):
-        changed(default_settings(), [text])
+        changed(PIPELINE.settings, [text])
 
 
 def test_none_is_a_value_only_where_it_is_allowed():
-    assert changed(default_settings(), ["match.ransac_threshold=none"])["match"].ransac_threshold is None
+    assert changed(PIPELINE.settings, ["match.ransac_threshold=none"])["match"].ransac_threshold is None
     with pytest.raises(JaxbaError, match="give a number"):
-        changed(default_settings(), ["match.ratio=none"])
+        changed(PIPELINE.settings, ["match.ratio=none"])
 
 
 def test_allowed_says_ranges_in_words():
@@ -80,17 +80,15 @@ def test_allowed_says_ranges_in_words():
 
 
 def test_a_toml_of_all_settings_reads_back_as_they_were(tmp_path):
-    settings = changed(
-        default_settings(), ["match.ratio=0.7", 'crs.target_crs=a "b" \\ c\n\td\x7f', "adjust.ftol=1e-9"]
-    )
+    settings = changed(PIPELINE.settings, ["match.ratio=0.7", 'crs.target_crs=a "b" \\ c\n\td\x7f', "adjust.ftol=1e-9"])
     for explain in (False, True):
         (tmp_path / "jaxba.toml").write_text(to_toml(settings, explain=explain))
-        assert from_toml(tmp_path / "jaxba.toml", default_settings()) == settings
+        assert from_toml(tmp_path / "jaxba.toml", PIPELINE.settings) == settings
 
 
 def test_a_toml_changes_what_it_names_and_nothing_else(tmp_path):
     (tmp_path / "a.toml").write_text("[match]\nransac_threshold = 2\n[features]\nnfeatures = 3000\n")
-    before = changed(default_settings(), ["match.ratio=0.7"])
+    before = changed(PIPELINE.settings, ["match.ratio=0.7"])
     after = from_toml(tmp_path / "a.toml", before)
     assert after == changed(before, ["match.ransac_threshold=2", "features.nfeatures=3000"])
 
@@ -114,19 +112,19 @@ def test_a_toml_changes_what_it_names_and_nothing_else(tmp_path):
 def test_a_bad_toml_is_refused_with_the_file_and_what_is_allowed(tmp_path, text, message):
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(JaxbaError, match=message):
-        from_toml(tmp_path / "a.toml", default_settings())
+        from_toml(tmp_path / "a.toml", PIPELINE.settings)
 
 
 def test_a_toml_that_is_not_there_or_no_text_is_refused(tmp_path):
     with pytest.raises(JaxbaError, match=r"a\.toml: there is no such file"):
-        from_toml(tmp_path / "a.toml", default_settings())
+        from_toml(tmp_path / "a.toml", PIPELINE.settings)
     (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(JaxbaError, match=r"b\.toml: cannot be read as text"):
-        from_toml(tmp_path / "b.toml", default_settings())
+        from_toml(tmp_path / "b.toml", PIPELINE.settings)
 
 
 def test_every_parameter_is_explained_once():
-    rows = explained(default_settings())
+    rows = explained(PIPELINE.settings)
     assert len({name for name, *_ in rows}) == len(rows)
     assert dict((name, (default, range_)) for name, default, range_, _ in rows)["match.ratio"] == (
         "0.75",

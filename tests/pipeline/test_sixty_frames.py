@@ -19,6 +19,7 @@ from small_survey import repaint
 
 from jaxba.engine import Resources
 from jaxba.engine._workers import memory_for
+from jaxba.pipeline import PIPELINE
 from jaxba.report import project_settings, status
 from jaxba.report.diagnosis import diagnose
 from jaxba.simulation.photos import Params, write_survey
@@ -120,11 +121,11 @@ def test_the_five_others_are_named_with_the_reason(survey: Path, first: Ended):
 
 @pytest.mark.slow
 def test_status_and_diagnosis_name_them_too(survey: Path, first: Ended):
-    found = status(survey / "project", project_settings(survey / "project"))
+    found = status(survey / "project", PIPELINE, project_settings(survey / "project", PIPELINE))
     assert found.is_done and {left.name for _, left in found.left_out} == {TRUNCATED, BLACK, CRASHES, HANGS, LARGE}
     stage = next(stage for stage in found.stages if stage.stage == "features")
     assert (stage.num_done, stage.num_all) == (57, 60)  # three without a record
-    causes = {diagnosis.name: diagnosis for diagnosis in diagnose(survey / "project")}
+    causes = {diagnosis.name: diagnosis for diagnosis in diagnose(survey / "project", PIPELINE)}
     assert causes["out of memory"].figures["photos"] == [LARGE] and causes["crash"].figures["photos"] == [CRASHES]
     assert "SIGSEGV" in causes["crash"].cause and "--max-memory" in causes["out of memory"].cure
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.truth import Figure, compare, markdown
-from jaxba.pipeline import changed, default_settings, run_pipeline
+from jaxba.engine import changed
+from jaxba.pipeline import PIPELINE, run_pipeline
 from jaxba.simulation.photos import Params, write_survey
 
 pytestmark = pytest.mark.slow
@@ -19,9 +20,7 @@ pytestmark = pytest.mark.slow
 def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
     folder: Path = tmp_path_factory.mktemp("truth")
     write_survey(folder / "survey", Params(num_images=12, num_oblique=3, width_px=800, seed=3))
-    settings = changed(
-        default_settings(), ["features.nfeatures=3000", "crs.target_crs=EPSG:32615", "workers.workers=1"]
-    )
+    settings = changed(PIPELINE.settings, ["features.nfeatures=3000", "crs.target_crs=EPSG:32615", "workers.workers=1"])
     run_pipeline(folder / "survey" / "photos", folder / "project", settings)
     found = compare(folder / "survey", folder / "project")
     print(markdown(found))

@@ -16,7 +16,8 @@ from small_survey import NUM_PHOTOS, Survey, repaint
 
 from jaxba import JaxbaError
 from jaxba.cli import main
-from jaxba.pipeline import changed, default_settings, run_pipeline
+from jaxba.engine import changed
+from jaxba.pipeline import PIPELINE, run_pipeline
 from jaxba.report._recorded import recorded
 from jaxba.report.diagnosis import RULES, diagnose
 from jaxba.report.diagnosis._adjustment import out_of_steps
@@ -33,7 +34,7 @@ def found(survey: Survey, *changes: str, until: str | None, **lists: Path) -> di
     """Run a survey as far as it goes, and return what is diagnosed."""
     with contextlib.suppress(JaxbaError):  # diagnosis is for runs that stop, too
         survey.run(*changes, until=until, **lists)
-    return {diagnosis.name: diagnosis for diagnosis in diagnose(survey.project)}
+    return {diagnosis.name: diagnosis for diagnosis in diagnose(survey.project, PIPELINE)}
 
 
 def photos_of(survey: Survey) -> list[Path]:
@@ -42,7 +43,7 @@ def photos_of(survey: Survey) -> list[Path]:
 
 def places(survey: Survey) -> list[tuple[str, float, float, float]]:
     """Name, longitude, latitude and height of each photo's tags."""
-    positions = [(photo.name, photo.position) for photo in recorded(survey.project).done.photos]
+    positions = [(photo.name, photo.position) for photo in recorded(survey.project, PIPELINE).done.photos]
     return [(name, p.x, p.y, p.z_m) for name, p in positions]
 
 
@@ -58,9 +59,9 @@ def geo_txt(path: Path, crs: str, rows: list[tuple[str, float, float, float]]) -
 
 def test_a_clean_survey_triggers_no_rule_and_is_not_touched(made: Survey, capsys: pytest.CaptureFixture[str]):
     before = {str(path): path.stat().st_mtime_ns for path in made.project.rglob("*")}
-    assert diagnose(made.project) == []
+    assert diagnose(made.project, PIPELINE) == []
     assert {str(path): path.stat().st_mtime_ns for path in made.project.rglob("*")} == before
-    case = recorded(made.project)
+    case = recorded(made.project, PIPELINE)
     assert case.done.export is not None and len(case.done.features) == NUM_PHOTOS and case.stale is None
     with pytest.raises(SystemExit) as ended:
         main(["diagnose", str(made.project)])
@@ -152,7 +153,7 @@ def test_bent_photos_have_a_large_median_and_more_steps_do_not_help(
 
 
 def test_a_solver_out_of_steps_with_a_high_cost_speaks_of_bad_input(made: Survey):
-    case = recorded(made.project)
+    case = recorded(made.project, PIPELINE)
     poor = dataclasses.replace(case.done.adjust, solver="max_nfev", median_px=4.2)
     diagnosis = out_of_steps(dataclasses.replace(case, done=dataclasses.replace(case.done, adjust=poor)))
     assert diagnosis is not None and "more steps do not help" in diagnosis.cause
@@ -239,17 +240,20 @@ def test_altitudes_that_climb_in_one_flight(tmp_path: Path):
 
 
 def test_photos_over_the_memory_limit(made: Survey, tmp_path: Path):
-    settings = changed(default_settings(), ["features.nfeatures=2000", "workers.max_memory=150MB"])
+    settings = changed(PIPELINE.settings, ["features.nfeatures=2000", "workers.max_memory=150MB"])
     with pytest.raises(JaxbaError):
         run_pipeline(made.photos, tmp_path / "project", settings, until="features")
-    result = {diagnosis.name: diagnosis for diagnosis in diagnose(tmp_path / "project")}
+    result = {diagnosis.name: diagnosis for diagnosis in diagnose(tmp_path / "project", PIPELINE)}
     assert len(result["out of memory"].figures["photos"]) == NUM_PHOTOS
     assert "workers.max_memory=150MB allows 150.0 MB" in result["out of memory"].cause
     assert result["stopped"].figures["stage"] == "features"
 
 
 def test_workers_that_ended_are_named_by_what_they_died_of(made: Survey):
-    case, died = recorded(made.project), "its worker process was killed by {} twice: out of memory, or a broken file"
+    case, died = (
+        recorded(made.project, PIPELINE),
+        "its worker process was killed by {} twice: out of memory, or a broken file",
+    )
     lost = (
         Left(name="SIM_0001.JPG", reason=died.format("SIGKILL")),
         Left(name="SIM_0002.JPG", reason=died.format("SIGSEGV")),
@@ -262,10 +266,10 @@ def test_workers_that_ended_are_named_by_what_they_died_of(made: Survey):
 
 
 def test_features_over_the_store_limit(made: Survey, tmp_path: Path):
-    settings = changed(default_settings(), ["features.nfeatures=20000", "workers.max_store=1MB"])
+    settings = changed(PIPELINE.settings, ["features.nfeatures=20000", "workers.max_store=1MB"])
     with pytest.raises(JaxbaError):
         run_pipeline(made.photos, tmp_path / "project", settings, until="features")
-    result = {diagnosis.name: diagnosis for diagnosis in diagnose(tmp_path / "project")}
+    result = {diagnosis.name: diagnosis for diagnosis in diagnose(tmp_path / "project", PIPELINE)}
     assert "workers.max_store=1MB allows 1.0 MB" in result["out of disk"].cause
 
 
@@ -275,7 +279,7 @@ def test_a_killed_run_is_said_with_what_it_needed(made: Survey, tmp_path: Path, 
     shutil.rmtree(survey.project / "stages" / stage)
     run = json.loads((survey.project / "run.json").read_text())
     (survey.project / "run.json").write_text(json.dumps({**run, "stage": stage}))
-    (diagnosis,) = diagnose(survey.project)
+    (diagnosis,) = diagnose(survey.project, PIPELINE)
     assert diagnosis.name == "killed" and f"killed in stage {stage}" in diagnosis.cause
     assert "GB" in diagnosis.cause and "Run again" in diagnosis.cure
 
@@ -284,18 +288,18 @@ def test_records_of_other_parameters_are_not_believed(made: Survey, tmp_path: Pa
     survey = made.copy(tmp_path)
     toml = survey.project / "jaxba.toml"
     toml.write_text(toml.read_text().replace("max_rounds = 5", "max_rounds = 6"))
-    case = recorded(survey.project)
+    case = recorded(survey.project, PIPELINE)
     assert case.stale == "adjust" and case.done.start is not None and case.done.adjust is None
-    assert [diagnosis.name for diagnosis in diagnose(survey.project)] == ["out of date"]
+    assert [diagnosis.name for diagnosis in diagnose(survey.project, PIPELINE)] == ["out of date"]
 
 
 def test_every_rule_says_nothing_of_a_project_without_stages(made: Survey, tmp_path: Path):
     survey = made.copy(tmp_path)
     shutil.rmtree(survey.project / "stages")
-    case = recorded(survey.project)
+    case = recorded(survey.project, PIPELINE)
     assert [rule(case) for rule in RULES] == [None] * len(RULES)
     with pytest.raises(JaxbaError, match="is no project"):
-        diagnose(tmp_path)
+        diagnose(tmp_path, PIPELINE)
 
 
 @pytest.mark.parametrize("name", ["caliterra", "copr"])

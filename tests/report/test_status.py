@@ -11,15 +11,16 @@ import pytest
 from small_survey import NUM_PHOTOS, Survey, repaint
 
 from jaxba import JaxbaError
+from jaxba.engine import changed
 from jaxba.engine._lock import locked
-from jaxba.pipeline import NAMES, Event, changed
+from jaxba.pipeline import NAMES, PIPELINE, Event
 from jaxba.report import project_settings, status
 
 FIRST = "SIM_0001.JPG"
 
 
 def standing(survey: Survey, *changes: str) -> dict[str, tuple[str, str]]:
-    found = status(survey.project, changed(project_settings(survey.project), changes))
+    found = status(survey.project, PIPELINE, changed(project_settings(survey.project, PIPELINE), changes))
     return {stage.stage: (stage.state, stage.reason) for stage in found.stages}
 
 
@@ -29,7 +30,7 @@ def files(folder: Path) -> dict[str, int]:
 
 def test_a_project_that_is_done_says_so_and_is_not_touched(made: Survey):
     before = files(made.project)
-    found = status(made.project, project_settings(made.project))
+    found = status(made.project, PIPELINE, project_settings(made.project, PIPELINE))
     assert found.is_done and [stage.stage for stage in found.stages] == list(NAMES) and found.activity == ""
     counts = {stage.stage: stage.num_all for stage in found.stages}
     assert counts["features"] == NUM_PHOTOS and counts["crs"] == 1
@@ -51,7 +52,7 @@ def test_a_changed_photo_makes_its_features_stale_alone(made: Survey, tmp_path: 
         file.write(b"\0")  # behind the end of the JPEG
     assert standing(survey)["metadata"] == ("stale", "changed: files")
     survey.run(until="pairs")
-    found = status(survey.project, project_settings(survey.project))
+    found = status(survey.project, PIPELINE, project_settings(survey.project, PIPELINE))
     features = next(stage for stage in found.stages if stage.stage == "features")
     assert (features.state, features.num_done, features.reason) == ("stale", NUM_PHOTOS - 1, "changed: photo")
 
@@ -79,19 +80,22 @@ def test_a_stopped_run_tells_where_and_why(photos: Path, tmp_path: Path):
 
     with pytest.raises(KeyboardInterrupt):
         survey.run(workers=1, tell=stop)
-    found = status(survey.project, project_settings(survey.project))
+    found = status(survey.project, PIPELINE, project_settings(survey.project, PIPELINE))
     features = next(stage for stage in found.stages if stage.stage == "features")
     assert features.state == "partly done" and 2 <= features.num_done < NUM_PHOTOS
     assert found.activity == "the last run stopped in stage features: interrupted"
     with locked(survey.project):
-        assert "a run works on it (process" in status(survey.project, project_settings(survey.project)).activity
+        assert (
+            "a run works on it (process"
+            in status(survey.project, PIPELINE, project_settings(survey.project, PIPELINE)).activity
+        )
 
 
 def test_a_run_that_was_killed_is_told_from_one_that_ended(made: Survey, tmp_path: Path):
     survey = made.copy(tmp_path)
     run = json.loads((survey.project / "run.json").read_text())
     (survey.project / "run.json").write_text(json.dumps({**run, "stage": "match"}))
-    found = status(survey.project, project_settings(survey.project))
+    found = status(survey.project, PIPELINE, project_settings(survey.project, PIPELINE))
     assert found.activity == "the last run was killed in stage match; the same command goes on from there"
 
 
@@ -111,7 +115,7 @@ def test_failed_photos_and_rejected_pairs_are_listed(made: Survey, tmp_path: Pat
         lambda pixels: np.random.default_rng(0).integers(255, size=pixels.shape, dtype=np.uint8),
     )
     survey.run("pairs.method=exhaustive", until="match")
-    found = status(survey.project, project_settings(survey.project))
+    found = status(survey.project, PIPELINE, project_settings(survey.project, PIPELINE))
     assert [(stage, left.name) for stage, left in found.left_out] == [("features", FIRST)]
     others = [f"SIM_0002.JPG, SIM_{number:04d}.JPG" for number in range(3, NUM_PHOTOS + 1)]
     assert [left.name for left in found.rejected] == others
@@ -120,7 +124,7 @@ def test_failed_photos_and_rejected_pairs_are_listed(made: Survey, tmp_path: Pat
 
 def test_a_folder_that_is_no_project_is_refused(tmp_path: Path):
     with pytest.raises(JaxbaError, match="is no project; give the folder that `jaxba run --out` was given"):
-        project_settings(tmp_path)
+        project_settings(tmp_path, PIPELINE)
 
 
 def test_the_command_tells_the_same_and_its_exit_code_whether_all_is_done(made: Survey):

@@ -15,6 +15,7 @@ from jaxba import JaxbaError
 from jaxba.cli import main
 from jaxba.io import CrsText
 from jaxba.io._read_cloud import read_csv_cloud, read_las, read_ply
+from jaxba.pipeline import PIPELINE
 from jaxba.report.verification import Params, verify
 
 
@@ -27,7 +28,9 @@ def export(made: Survey, tmp_path: Path) -> Path:
 
 
 def failures(export: Path, **limits: float) -> dict[str, str]:
-    return {check.name: check.text for check in verify(export.parent, Params(**limits)) if check.state == "FAIL"}
+    return {
+        check.name: check.text for check in verify(export.parent, PIPELINE, Params(**limits)) if check.state == "FAIL"
+    }
 
 
 def rewrite_csv(path: Path, change: Callable[[list[list[str]]], None]) -> None:
@@ -37,7 +40,7 @@ def rewrite_csv(path: Path, change: Callable[[list[list[str]]], None]) -> None:
 
 
 def test_a_clean_project_passes_every_check(made: Survey):
-    found = verify(made.project, Params())
+    found = verify(made.project, PIPELINE, Params())
     assert {check.state for check in found} == {"ok"}
     names = [check.name for check in found]
     assert len(set(names)) == len(names) > 30 and all(check.text for check in found)
@@ -320,7 +323,7 @@ def test_counts_that_disagree(export: Path):
 def test_a_block_without_positions_skips_what_needs_a_place(export: Path):
     """Its record and its frame say so; the files that need a CRS are not written then."""
     rewrite_json(export / "colmap" / "frame.json", lambda content: content.pop("origin"))
-    states = {check.name: check for check in verify(export.parent, Params())}
+    states = {check.name: check for check in verify(export.parent, PIPELINE, Params())}
     assert states["CRS"].state == "skipped" and "no place on earth" in states["CRS"].text
     assert states["median error"].state == "ok"
 
@@ -347,4 +350,4 @@ def test_bad_input_is_told_from_failure(export: Path, tmp_path: Path, capsys: py
 
 def test_a_folder_that_is_no_project_is_said(tmp_path: Path):
     with pytest.raises(JaxbaError, match="is no project"):
-        verify(tmp_path, Params())
+        verify(tmp_path, PIPELINE, Params())

@@ -1,13 +1,13 @@
 """Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
 
 from jaxba.engine import _pool
+from jaxba.engine._limits import size_text
 from jaxba.engine._words import some
 from jaxba.engine._workers import Resources, bytes_of, machine_memory, memory_for
-from jaxba.pipeline._limits import num_keypoints, size_text, store_bytes
-from jaxba.pipeline.features import Params
 from jaxba.report._recorded import Recorded
 from jaxba.report.diagnosis._diagnosis import Diagnosis
 from jaxba.scene import Left
+from jaxba.vision import most_keypoints, store_bytes
 
 _BY_PHOTOS = ("features", "match")
 
@@ -101,9 +101,8 @@ def over_store(case: Recorded) -> Diagnosis | None:
     if case.stopped is None or case.stopped.name != "features" or case.done.pairs is None:
         return None
     resources: Resources = case.done.settings["workers"]
-    params: Params = case.done.settings["features"]
-    detector = case.done.routing.detector
-    need = store_bytes(len(case.done.photos), detector, num_keypoints(detector, params))
+    detector, nfeatures = case.done.routing.detector, case.done.settings["features"].nfeatures
+    need = store_bytes(len(case.done.photos), detector, most_keypoints(detector, nfeatures))
     allowed = bytes_of(resources.max_store, float("nan"))  # a share of a disk whose room has changed since says nothing
     if not need > allowed:
         return None

@@ -4,10 +4,9 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxba.engine._words import some
-from jaxba.pipeline.tracks import pairs_between
 from jaxba.report._recorded import Recorded
 from jaxba.report.diagnosis._diagnosis import Diagnosis
-from jaxba.scene import components
+from jaxba.scene import components, pairs_between
 
 _OVERLAPS = 0.3  # pairs that overlap by more should match
 _MOST = 0.5

@@ -7,6 +7,7 @@ was killed, is diagnosed from the stages that ended. Causes come before what fol
 from collections.abc import Callable
 from pathlib import Path
 
+from jaxba.engine._stage import Pipeline
 from jaxba.report._recorded import Recorded, recorded
 from jaxba.report.diagnosis import (
     _adjustment as adjustment,
@@ -38,12 +39,12 @@ RULES: tuple[Rule, ...] = (
 )
 
 
-def diagnose(folder: Path) -> list[Diagnosis]:
+def diagnose(folder: Path, pipeline: Pipeline) -> list[Diagnosis]:
     """Return what looks poor in a project; empty where nothing does. Nothing is run or changed.
 
     Raises `JaxbaError` where the folder is no project.
     """
-    case = recorded(folder)
+    case = recorded(folder, pipeline)
     found = [diagnosis for rule in RULES if (diagnosis := rule(case)) is not None]
     said = limits.stopped(case)
     return [*found, said] if said is not None else found

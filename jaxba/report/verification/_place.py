@@ -16,8 +16,8 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from jaxba.engine._project import Project
+from jaxba.engine._stage import Pipeline
 from jaxba.engine._store import load, read_record
-from jaxba.pipeline import control, metadata
 from jaxba.report.verification._check import Check, failed, judged, skipped
 from jaxba.report.verification._exported import CLOUDS, DESCRIPTION, FRAME, TEXT, Exported
 
@@ -42,7 +42,9 @@ class Measured:
     unit_m: float
 
 
-def place_checks(project: Project, exported: Exported, offset_m: Float[np.ndarray, "3"]) -> Iterator[Check]:
+def place_checks(
+    project: Project, pipeline: Pipeline, exported: Exported, offset_m: Float[np.ndarray, "3"]
+) -> Iterator[Check]:
     """Yield the checks of CRS and place; skipped where the block has none.
 
     `offset_m`: what control moved the measured positions by.
@@ -51,7 +53,7 @@ def place_checks(project: Project, exported: Exported, offset_m: Float[np.ndarra
     if missing:
         yield failed("CRS", f"the record of the {missing[0]} stage is missing or damaged; run again to make it anew.")
         return
-    reference = load(project.stage("control"), control.Outputs).reference
+    reference = load(project.stage("control"), pipeline["control"].module.Outputs).reference
     if (exported.has(FRAME) and exported.frame is None) or reference.frame is None:
         for name in ("CRS", "area of use", "cloud at its cameras", "positions in the cloud's box", "camera positions"):
             yield skipped(name, _NO_PLACE)
@@ -65,7 +67,7 @@ def place_checks(project: Project, exported: Exported, offset_m: Float[np.ndarra
             yield skipped(f"area of use {name}", "no point has finite coordinates")
             continue
         yield _in_area_of_use(name, xy, flat)
-    photos = load(project.stage("metadata"), metadata.Outputs).photos
+    photos = load(project.stage("metadata"), pipeline["metadata"].module.Outputs).photos
     xy = {}
     for photo, is_used in zip(photos, reference.is_used, strict=True):
         if is_used and photo.position is not None:

@@ -8,15 +8,15 @@ earth (see `_place.py`).
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._project import Project
+from jaxba.engine._stage import Pipeline
 from jaxba.engine._store import damaged_file, load, read_record
-from jaxba.pipeline import adjust, export
 from jaxba.report.verification._check import Check, failed, judged, ok, skipped
 from jaxba.report.verification._exported import (
     BINARY,
@@ -49,7 +49,7 @@ class Params(Parameters):
     min_inlier_rate: float = parameter(0.9, low=0.5, high=1, help="the least share of observations that fit")
 
 
-def verify(folder: Path, params: Params) -> list[Check]:
+def verify(folder: Path, pipeline: Pipeline, params: Params) -> list[Check]:
     """Check the exports of a project.
 
     Raises `JaxbaError` where the folder is no project, or nothing was exported yet.
@@ -62,9 +62,10 @@ def verify(folder: Path, params: Params) -> list[Check]:
         raise JaxbaError(
             f"{folder}: nothing was exported yet; let `jaxba run` end first, `jaxba status` tells how far."
         )
-    written = load(record, export.Outputs)
+    written = load(record, pipeline["export"].module.Outputs)
     exported, schema = read_export(project.export, written.files)
-    adjusted = load(project.stage("adjust"), adjust.Outputs) if read_record(project.stage("adjust")) else None
+    record = project.stage("adjust")
+    adjusted = load(record, pipeline["adjust"].module.Outputs) if read_record(record) else None
     return [
         _files(project.export, written),
         *schema,
@@ -73,11 +74,11 @@ def verify(folder: Path, params: Params) -> list[Check]:
         _same_points(exported, adjusted),
         _median(exported, params),
         _inliers(adjusted, params),
-        *place_checks(project, exported, _moved_m(adjusted)),
+        *place_checks(project, pipeline, exported, _moved_m(adjusted)),
     ]
 
 
-def _moved_m(adjusted: adjust.Outputs | None) -> np.ndarray:
+def _moved_m(adjusted: Any | None) -> np.ndarray:
     """Return what control moved the measured positions by: in the adjustment, or the block beside them afterwards."""
     if adjusted is None:
         return np.zeros(3)
@@ -85,7 +86,7 @@ def _moved_m(adjusted: adjust.Outputs | None) -> np.ndarray:
     return adjusted.gnss_offset_m if adjusted.gnss_offset_m.any() else away_m
 
 
-def _files(folder: Path, written: export.Outputs) -> Check:
+def _files(folder: Path, written: Any) -> Check:
     """All files are there and hold something; one that was changed since is named, and judged by its contents alone."""
     missing = [name for name in written.files if not (folder / name).is_file()]
     empty = [name for name in written.files if name not in missing and not (folder / name).stat().st_size]
@@ -187,7 +188,7 @@ def _all_finite(file: str, values: dict[str, np.ndarray], names: Sequence[str]) 
     )
 
 
-def _same_points(exported: Exported, adjusted: adjust.Outputs | None) -> Check:
+def _same_points(exported: Exported, adjusted: Any | None) -> Check:
     """Every cloud has the same points at the same coordinates, and COLMAP's points are those in the CRS.
 
     Where control was fitted by twelve parameters, the clouds are mapped by them and COLMAP's poses cannot be.
@@ -272,7 +273,7 @@ def _errors_px(exported: Exported) -> np.ndarray:
     return reprojection_errors(problem)
 
 
-def _inliers(adjusted: adjust.Outputs | None, params: Params) -> Check:
+def _inliers(adjusted: Any | None, params: Params) -> Check:
     name = "inlier rate"
     if adjusted is None:
         return failed(name, "the record of the adjust stage is missing or damaged; run again to make it anew.")

@@ -3,16 +3,19 @@
 A work is current when its record has the key that it would be made under now, and its files are as they were written.
 """
 
+import errno
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jaxba._errors import JaxbaError
 from jaxba.engine import _store
 from jaxba.engine._key import Key, by_field, what_changed
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._project import Project
-from jaxba.pipeline._stages import Done, Stage
+from jaxba.engine._stage import Stage
 from jaxba.scene import Left
 
 
@@ -38,13 +41,13 @@ class Work:
         return record if record is not None and record.key == self.key else None
 
 
-def works(project: Project, stage: Stage, done: Done, params: Parameters) -> list[Work]:
+def works(project: Project, stage: Stage, done: Any, params: Parameters) -> list[Work]:
     """Return the works of a stage, from what the stages before it have made."""
     module = stage.module.__name__
-    if stage.collect is None:
+    if not stage.is_by_photo:
         inputs = stage.inputs(done)
         values = by_field(inputs)
-        if stage.name == "metadata":  # which keeps where the photos are
+        if stage.reads_places:
             values["places"] = [str(file.path) for file in done.files]
         return [Work(None, project.stage(stage.name), Key.of(module, params, values), inputs)]
     return [
@@ -69,13 +72,13 @@ def why_to_do(project: Project, stage: Stage, work: Work, params: Parameters) ->
         return what_changed(record.key, work.key, params)
     if damage := _store.damage(work.folder):
         return damage
-    if stage.name == "export":
+    if stage.writes_files:
         outputs = _store.load(work.folder, stage.module.Outputs)
         return _store.damaged_file(project.export, dict(zip(outputs.files, outputs.sha256, strict=True)))
     return None
 
 
-def collected(stage: Stage, done: Done, items: Sequence[Work]) -> tuple[Any, tuple[Left, ...]]:
+def collected(stage: Stage, done: Any, items: Sequence[Work]) -> tuple[Any, tuple[Left, ...]]:
     """Return what a stage made, all of whose works have been done, and the photos that it could make nothing of."""
     if stage.collect is None:
         return _store.load(items[0].folder, stage.module.Outputs), ()
@@ -98,3 +101,20 @@ def without_path(name: str, reason: str) -> str:
     """Return a reason without the photo's path before it, which is said beside it, and may have changed since."""
     before, found, after = reason.partition(name)
     return after.lstrip(": ") if found and (not before or before.endswith(("/", "\\"))) else reason
+
+
+def run_one(module: str, folder: Path, inputs: Any, params: Parameters, key: Key) -> str | None:
+    """Run a stage for one photo in a worker and save what it makes; return why it could not, or None."""
+    stage = importlib.import_module(module)
+    try:
+        outputs = stage.run(inputs, params)
+    except JaxbaError as error:
+        system = error.__cause__ or error.__context__
+        number = system.errno if isinstance(system, OSError) else None
+        if number == errno.ENOMEM:
+            raise MemoryError from error
+        if number is None:  # else it is not the photo's fault but the machine's, and may go well another time
+            _store.save_failure(folder, str(error), key)
+        return str(error)
+    _store.save(folder, outputs, key)
+    return None

@@ -1,4 +1,4 @@
-"""Limits that stop a run before it wastes hours: features that would not fit on the disk, too many photos that fail."""
+"""Limits that stop a run before it wastes hours: what would not fit on the disk, too many photos that fail."""
 
 import shutil
 from collections.abc import Sequence
@@ -6,49 +6,26 @@ from pathlib import Path
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._workers import Resources, bytes_of
-from jaxba.pipeline._tuning import tune
-from jaxba.pipeline.features import Params
 from jaxba.scene import Left
 
-_OTHER_BYTES = 35.0  # of a keypoint: position, size and angle in float64, colour
-_DESCRIPTOR_BYTES = {"orb": 32, "akaze": 61}
-_SIFT_BYTES, _SIFT_ORIENTATIONS = 128, 1.3  # up to 1.25 were measured at 2000 keypoints a photo
-_PHOTO_BYTES = 6000  # record and headers
 _SHOWN = 3
 
 
-def num_keypoints(detector: str, params: Params) -> int:
-    """Return the most keypoints that a photo has: as set, or the detector's own number."""
-    return tune(detector, (), None, nfeatures=params.nfeatures).nfeatures
-
-
-def store_bytes(num_photos: int, detector: str, nfeatures: int) -> float:
-    """Return the bytes that the features of so many photos take on the disk at most."""
-    if detector in _DESCRIPTOR_BYTES:
-        keypoint = _DESCRIPTOR_BYTES[detector] + _OTHER_BYTES
-    else:
-        keypoint = (_SIFT_BYTES + _OTHER_BYTES) * _SIFT_ORIENTATIONS
-    return num_photos * (nfeatures * keypoint + _PHOTO_BYTES)
-
-
-def check_store(store: Path, num_photos: int, detector: str, params: Params, resources: Resources) -> None:
-    """Raise `JaxbaError` where the features of so many photos may not fit, or may take more than is allowed.
+def check_room(store: Path, need: float, resources: Resources, *, what: str, each: str, cure: str) -> None:
+    """Raise `JaxbaError` where bytes may not fit on the disk, or are more than is allowed.
 
     - `store`: the folder where they are to lie; what lies there already is theirs, or is replaced: it counts as free.
-    - `detector`: of all photos.
+    - `what`: they are, with how many. `each`: what one of these takes. `cure`: what to do other than allow more.
     """
-    nfeatures = num_keypoints(detector, params)
-    need = store_bytes(num_photos, detector, nfeatures)
     place = next(folder for folder in (store, *store.absolute().parents) if folder.exists())
     free = float(shutil.disk_usage(place).free)
     used = sum(path.stat().st_size for path in store.rglob("*") if path.is_file())
     allowed = min(bytes_of(resources.max_store, free + used), free + used)
     if need > allowed:
         raise JaxbaError(
-            f"the features of {num_photos:,} photos take up to {size_text(need)} on the disk, at {nfeatures:,} "
-            f"keypoints a photo; --max-store {resources.max_store} allows {size_text(allowed)}, {size_text(free)} are "
-            "free. Set fewer features.nfeatures, take fewer photos, raise --max-store, or choose an --out on a larger "
-            "disk."
+            f"{what} take up to {size_text(need)} on the disk, {each}; --max-store {resources.max_store} allows "
+            f"{size_text(allowed)}, {size_text(free)} are free. {cure}, raise --max-store, or choose an --out on a "
+            "larger disk."
         )
 
 

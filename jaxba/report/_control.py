@@ -1,37 +1,33 @@
 """What a run tells of control and check points."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxba.engine._words import many
+from jaxba.scene import Control, ControlFit, Left
 
 _SHOWN = 10
 
 
-def control_lines(outputs: Any) -> tuple[str, list[str]]:
-    """Return what the control stage made in a line, and its notes."""
-    control = outputs.control
-    if not control.num_points and not outputs.notes:
-        return "no list of control points", []
+def control_lines(control: Control, notes: Sequence[str], left_out: Sequence[Left]) -> list[str]:
+    """Return what there is of control in a line, then the notes on it and what cannot be used."""
+    if not control.num_points and not notes:
+        return ["no list of control points"]
     checks = int(control.is_check.sum())
     count = control.num_points - checks
     first = f"{many(count, 'control point')}, {many(checks, 'check point')}; {many(len(control.mark_point), 'mark')}"
     images = len(np.unique(control.mark_image))
-    left = [f"Left out: {entry.name}: {entry.reason}." for entry in outputs.left_out]
+    left = [f"Left out: {entry.name}: {entry.reason}." for entry in left_out]
     if len(left) > _SHOWN:
         left = [*left[:_SHOWN], f"and {len(left) - _SHOWN} more such, each with its reason in summary.json."]
-    return f"{first} in {many(images, 'photo')}", [*outputs.notes, *left]
+    return [f"{first} in {many(images, 'photo')}", *notes, *left]
 
 
-def control_facts(done: Any) -> dict[str, Any]:
-    """Return the points and how the result fits them, as plain values."""
-    control, left_out = done.control.control, done.control.left_out
-    facts: dict[str, Any] = {
-        "asked_method": control.method,
-        "left_out": [{"name": entry.name, "reason": entry.reason} for entry in left_out],
-    }
-    fit = None if done.adjust is None else done.adjust.control
+def control_facts(control: Control, fit: ControlFit | None = None) -> dict[str, Any]:
+    """Return the points and, once it is known, how the result fits them, as plain values."""
+    facts: dict[str, Any] = {}
     if fit is not None:
         use = np.isfinite(fit.residual_m).any(axis=1)
         for role, rms, mine in (("control", fit.control_rms_m, ~control.is_check), ("check", fit.check_rms_m, None)):
@@ -56,7 +52,7 @@ def control_rows(facts: dict[str, Any] | None) -> list[tuple[str, str]]:
     return rows
 
 
-def _group(control: Any, fit: Any, rms_m: np.ndarray, rows: np.ndarray) -> dict[str, Any]:
+def _group(control: Control, fit: ControlFit, rms_m: np.ndarray, rows: np.ndarray) -> dict[str, Any]:
     """Return the figures of the control or of the check points that have residuals."""
     result: dict[str, Any] = {"num": int(rows.sum()), "rms_m": rms_m.tolist()}
     if rows.any():
@@ -71,7 +67,7 @@ def _group(control: Any, fit: Any, rms_m: np.ndarray, rows: np.ndarray) -> dict[
     return result
 
 
-def _point(control: Any, fit: Any, k: int) -> dict[str, Any]:
+def _point(control: Control, fit: ControlFit | None, k: int) -> dict[str, Any]:
     marks = int(np.count_nonzero(control.mark_point == k))
     result = {"name": control.names[k], "role": "check" if control.is_check[k] else "control", "marks": marks}
     if fit is None:

@@ -8,9 +8,8 @@ from PIL import Image
 
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.pipeline import features
-from jaxba.pipeline._tuning import Tuning, tune
 from jaxba.scene import Photo
-from jaxba.vision import ImageStatistics
+from jaxba.vision import ImageStatistics, Tuning, tune
 
 PLAIN = ImageStatistics(mean_brightness=120.0, flat_share=0.0, repeating_share=0.0)
 

@@ -1,12 +1,13 @@
 """Every test runs in float64, with the shapes and types of each annotated function and class checked at run time.
 
-What one process of a session has compiled, the others and the commands that tests start do not compile again.
+What was compiled once, by these tests, the commands that they start, or `python -m jaxba`, is not compiled again: they
+share one cache on the disk.
 """
 
 import gc
 import os
 import sys
-import tempfile
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,23 +16,32 @@ import jax
 import jaxtyping
 import pytest
 
+from jaxba.engine._compile_cache import use_compilation_cache
+
 if TYPE_CHECKING:
     from small_survey import Survey
 
 # what tests share is imported by name, by them and by the workers that they start
 sys.path += [str(folder) for folder in (Path(__file__).parent, *sorted(Path(__file__).parent.glob("[a-z]*/")))]
 jax.config.update("jax_enable_x64", True)
-_cache: tempfile.TemporaryDirectory[str] | None = None  # lasts as long as the session's first process
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    _cache = tempfile.TemporaryDirectory(prefix="jaxba-compiled-")
-    for name, value in (
-        ("jax_compilation_cache_dir", _cache.name),
-        ("jax_persistent_cache_min_compile_time_secs", 0.0),
-        ("jax_persistent_cache_min_entry_size_bytes", -1),
-    ):
-        jax.config.update(name, value)
-        os.environ[name.upper()] = str(value)
+use_compilation_cache()
 jaxtyping.install_import_hook("jaxba", "beartype.beartype")  # works only on modules that are not imported yet
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Deal the files to the processes: those with the most slow tests first, as many tests to each.
+
+    Each process begins with its share of the order, and takes over from the end of the other's when it is done.
+    """
+    files: dict[Path, list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        files[item.path].append(item)
+    slow = {path: sum(item.get_closest_marker("slow") is not None for item in found) for path, found in files.items()}
+    shares: list[list[pytest.Item]] = [[] for _ in range(int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))]
+    for number, path in enumerate(sorted(files, key=lambda path: (-slow[path], path))):
+        share = shares[number % len(shares)] if slow[path] else min(shares, key=len)
+        share += files[path]
+    items[:] = [item for share in shares for item in share]
 
 
 @pytest.fixture(scope="session")
@@ -57,23 +67,6 @@ def made(tmp_path_factory: pytest.TempPathFactory, photos: Path) -> "Survey":
     from small_survey import Survey, make_project, once, shared_folder
 
     return Survey(photos, once(shared_folder(tmp_path_factory), "run", make_project(photos)) / "project")
-
-
-# run real sizes, which optimised code pays for
-_LARGE = {"test_solve", "test_recovery", "test_cli", "test_cli_run", "test_cli_run_progress", "test_initialise"}
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Leave out XLA's costly optimisations where dozens of tiny programs are compiled: half the time.
-
-    The pipeline's tests share a run that one process has made, and hold results to its last bit: code that is compiled
-    otherwise rounds otherwise. So a change of this option also forgets the programs of before.
-    """
-    quick = item.path.stem not in _LARGE and item.path.parent.name != "pipeline"
-    if quick != jax.config.read("jax_disable_most_optimizations"):
-        jax.config.update("jax_disable_most_optimizations", quick)
-        jax.clear_caches()
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -19,6 +19,7 @@ from jaxba.cli import _progress, _solve, main
 from jaxba.cli._info import components
 from jaxba.cli._options import LossName, SolveOptions
 from jaxba.cli._text import to_json
+from jaxba.engine._compile_cache import folder_name
 from jaxba.geometry import BAL, LOSSES
 
 Answer = tuple[int, str, str]
@@ -299,12 +300,12 @@ def test_compilation_cache_is_in_the_users_folder_if_that_can_be(tmp_path: Path,
     blocked = tmp_path / "file"
     blocked.write_text("")
     expected, changes = {
-        "user's folder": (str(tmp_path / "jaxba"), {"XDG_CACHE_HOME": str(tmp_path)}),
+        "user's folder": (str(tmp_path / "jaxba" / folder_name()), {"XDG_CACHE_HOME": str(tmp_path)}),
         "jax's own variable": (str(tmp_path / "own"), {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own")}),
         "not writable": ("None", {"XDG_CACHE_HOME": str(blocked)}),
     }[case]
     code = (
-        "import jaxba, jax\nfrom jaxba.cli._cache import use_compilation_cache as use\nimport jaxba.ba\n"
+        "import jaxba, jax\nfrom jaxba.engine._compile_cache import use_compilation_cache as use\nimport jaxba.ba\n"
         "before = jax.config.jax_compilation_cache_dir\nuse()\n"
         "print(before, jax.config.jax_compilation_cache_dir)"
     )

@@ -5,10 +5,10 @@ import sys
 from pathlib import Path
 
 from jaxba.ba import GradientRow, check_gradients
-from jaxba.cli._cache import use_compilation_cache
 from jaxba.cli._options import SolveOptions
 from jaxba.cli._solve import fix, make_loss, parse_bounds
 from jaxba.cli._text import to_json
+from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.io import read_problem
 
 OVER = 1

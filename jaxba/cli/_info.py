@@ -11,9 +11,9 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxba.ba import AbstractPrior, Problem, Unknowns, free_gauge, quality
 from jaxba.ba._check import Prepared, prepare
-from jaxba.cli._cache import use_compilation_cache
 from jaxba.cli._result import intrinsics
 from jaxba.cli._text import first_of, gauge_text, many, table, to_json
+from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.geometry import CAMERAS, LOSSES
 from jaxba.io import read_problem
 

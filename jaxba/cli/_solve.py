@@ -14,10 +14,10 @@ import numpy as np
 from jaxba._errors import JaxbaError
 from jaxba.ba import HistoryStep, Problem, Rejected, solve_and_reject
 from jaxba.cli import _progress
-from jaxba.cli._cache import use_compilation_cache
 from jaxba.cli._options import SolveOptions
 from jaxba.cli._result import Run, facts, summary
 from jaxba.cli._text import to_json
+from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.geometry import LOSSES, AbstractLoss, Barron
 from jaxba.io import read_problem, refuse_same_file, what_bal_cannot_hold, write_bal, write_tile
 

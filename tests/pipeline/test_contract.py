@@ -20,9 +20,10 @@ from jaxba.engine import _store
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.engine._key import Key
 from jaxba.engine._parameters import Parameters
-from jaxba.pipeline import STAGES
-from jaxba.pipeline._events import Run
+from jaxba.pipeline import STAGES, Run
 from jaxba.pipeline._stages import Stage
+from jaxba.report import told_of
+from jaxba.scene import Left
 
 EVERY = pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
 
@@ -74,6 +75,28 @@ def test_a_stage_has_frozen_inputs_params_and_outputs(stage: Stage):
     for field in dataclasses.fields(stage.module.Params):
         assert field.metadata["help"] and field.default is not dataclasses.MISSING
     assert stage.module.Params() == stage.module.Params()
+
+
+@EVERY
+def test_a_stage_says_what_it_made_in_words_and_in_plain_values(stage: Stage, done: Run):
+    outputs = getattr(done.done, stage.name)
+    told = told_of(done.done)
+    before = fingerprint(outputs) if stage.collect is None else ""
+    lines, facts = stage.module.lines(outputs, told), stage.module.facts(outputs, told)
+    assert lines and all(isinstance(line, str) and line for line in lines)
+    assert lines == done.facts["stages"][stage.name]
+    assert set(facts) <= set(done.facts) and json.loads(json.dumps(facts)) is not None
+    assert lines == stage.module.lines(outputs, told) and (stage.collect or fingerprint(outputs) == before)
+
+
+@EVERY
+def test_a_stage_says_what_it_left_out_once(stage: Stage, done: Run):
+    left = Left(name="IMG_1.JPG", reason="it is broken.")
+    lines = stage.module.lines(getattr(done.done, stage.name), told_of(done.done, (left,)))
+    others = stage.module.lines(getattr(done.done, stage.name), told_of(done.done))
+    said = [line for line in lines if "IMG_1.JPG" in line]
+    may = stage.name in ("metadata", "features", "match", "start", "adjust")  # the others work on no single photo
+    assert said == (["IMG_1.JPG: it is broken."] if may else []) and len(lines) == len(others) + len(said)
 
 
 @EVERY

@@ -7,7 +7,7 @@ project/
   stages/<stage>/      what the stage made; features and match hold a folder a photo
   export/              the results
   summary.json         what became of each stage and each photo
-  .lock                held by the run that works here
+  .lock, .lock.holder  held by the run that works here; who that is
 """
 
 import contextlib

@@ -53,6 +53,7 @@ def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None
     lines = [",".join(CONTROL_COLUMNS)]
     for k, name in enumerate(table.names):
         numbers = [*table.surveyed[k], *table.adjusted[k], *table.residual_m[k], *table.std_m[k]]
+        # csv's writer leaves blanks and semicolons bare, and spreadsheets split at them when they are told to
         cells = [
             '"' + name.replace('"', '""') + '"' if set(name) & set(',"; ') else name,
             "check" if table.is_check[k] else "control",

@@ -4,7 +4,6 @@ Messages name the file, the line, the field and its value.
 """
 
 import csv
-import io
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,6 +32,7 @@ PLACE_COLUMNS = {
 }  # fmt: skip
 """Titles of the columns that say where something is, as `plain_title` writes them."""
 
+_LONGEST = 200  # characters of a text that a message repeats
 _UTM = re.compile(r"WGS\s*_?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 
 
@@ -47,7 +47,7 @@ def content_lines(text: str) -> tuple[list[Line], str]:
 def header_titles(line: str, names: Sequence[str]) -> list[str] | None:
     """Return the titles of a CSV's header line, which has one of `names`; None for what is none."""
     for separator in ",;\t":
-        cells = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+        cells = [cell.strip() for cell in _cells(line, separator)]
         if len(cells) >= 3 and any(plain_title(cell) in names for cell in cells):
             return cells
     return None
@@ -78,7 +78,7 @@ def csv_rows(
     """Yield number and cells by column of each line below the header; a column that is not there is empty."""
     separator = _separator(header, content)
     for line, words in content:
-        cells = next(csv.reader(io.StringIO(words), delimiter=separator), [])
+        cells = _cells(words, separator)
         if len(cells) != len(header):
             raise JaxbaError(
                 f"{name} line {line}: has {len(cells)} columns where the header has {len(header)}; mend it."
@@ -88,8 +88,16 @@ def csv_rows(
 
 def _separator(header: Sequence[str], content: Sequence[Line]) -> str:
     """Return the separator that cuts the first row into as many cells as the header has."""
-    fits = [s for s in ",;\t" if content and len(next(csv.reader([content[0][1]], delimiter=s))) == len(header)]
+    fits = [s for s in ",;\t" if content and len(_cells(content[0][1], s)) == len(header)]
     return fits[0] if fits else ","
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    """Return the cells of a line of CSV, which is not empty; the whole line where it holds a cell of over 131 kB."""
+    try:
+        return next(csv.reader([line], delimiter=separator))
+    except csv.Error:
+        return [line]
 
 
 def crs_of_comment(comment: str) -> str | None:
@@ -117,8 +125,9 @@ def read_crs(text: str, where: str, kind: str = "geo.txt") -> tuple[str, HeightK
     try:
         crs = CRS.from_user_input(text)
     except CRSError:
+        shown = text if len(text) <= _LONGEST else text[:_LONGEST] + "..."
         raise JaxbaError(
-            f"{where}: '{text}' is no CRS; give EPSG:4326, a PROJ string, or 'WGS84 UTM 17N' (a {kind} has it on its "
+            f"{where}: '{shown}' is no CRS; give EPSG:4326, a PROJ string, or 'WGS84 UTM 17N' (a {kind} has it on its "
             "first line, a CSV a header with the columns' names)."
         ) from None
     if crs.is_compound:

@@ -3,6 +3,7 @@
 Numbers are taken as they stand, NaN too: what they mean is for the caller to judge.
 """
 
+import csv
 import io
 import os
 from collections.abc import Sequence
@@ -39,9 +40,12 @@ def read_csv_cloud(path: str | os.PathLike[str]) -> CloudFile:
         JaxbaError: a column is missing or not known, a row is damaged, or rows have codes of several CRSs.
     """
     label = os.fspath(path)
-    header, *rows = read_bytes(path).decode("utf-8", "replace").splitlines()
-    _expect_columns(label, header.split(","), tuple(COLUMNS))
-    cells = [row.split(",") for row in rows]
+    lines = csv.reader(read_bytes(path).decode("utf-8", "replace").splitlines(), quoting=csv.QUOTE_NONE)
+    try:
+        header, *cells = lines
+    except csv.Error as error:
+        raise JaxbaError(f"{label}, line {lines.line_num}: {error}; {_CURE}.") from error
+    _expect_columns(label, header, tuple(COLUMNS))
     for number, row in enumerate(cells, 2):
         if len(row) != len(COLUMNS):
             raise JaxbaError(f"{label}, line {number}: {len(row)} values in {len(COLUMNS)} columns; {_CURE}.")

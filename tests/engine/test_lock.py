@@ -6,9 +6,10 @@ import threading
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from jaxba import JaxbaError
-from jaxba.engine._lock import _take, holder, locked
+from jaxba.engine._lock import holder, locked
 
 HOLD = """
 import sys, time
@@ -41,11 +42,28 @@ def test_two_runs_refuse_each_other_and_the_message_names_the_one_that_goes_on(o
 def test_a_look_at_the_holder_does_not_refuse_a_run(tmp_path: Path):
     with locked(tmp_path):
         pass
-    with open(tmp_path / ".lock", "r+") as looks:
-        assert _take(looks)
-        threading.Timer(0.03, looks.close).start()
-        with locked(tmp_path):
-            assert holder(tmp_path) is not None
+    looks = FileLock(tmp_path / ".lock", thread_local=False)
+    looks.acquire()
+    threading.Timer(0.03, looks.release).start()
+    with locked(tmp_path):
+        assert holder(tmp_path) is not None
+
+
+def test_what_the_holder_says_survives_every_attempt_of_others(tmp_path: Path):
+    with locked(tmp_path):
+        for _ in range(2):
+            with pytest.raises(JaxbaError, match=rf"process {os.getpid()} on"), locked(tmp_path):
+                pass
+            assert f"process {os.getpid()} on" in str(holder(tmp_path))
+
+
+def test_a_folder_that_may_not_be_written_to_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refused(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(FileLock, "acquire", refused)
+    with pytest.raises(JaxbaError, match=r"\.lock: it may not be written to; choose another --out"), locked(tmp_path):
+        pass
 
 
 def test_a_killed_run_locks_nobody_out(other, tmp_path: Path):

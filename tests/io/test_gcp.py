@@ -93,3 +93,15 @@ def test_csv_of_longitude_and_latitude_is_wgs_84():
 def test_bad_lists_are_refused_with_line_field_and_cure(text: str, message: str):
     with pytest.raises(JaxbaError, match=message):
         parse_control(text)
+
+
+def test_a_file_of_one_endless_line_is_refused_in_a_short_message():
+    with pytest.raises(JaxbaError, match=r"line 1: '\{\"type\".*\.\.\.' is no CRS") as caught:
+        parse_control('{"type": "' + "x" * 200_000 + '"}')
+    assert len(str(caught.value)) < 500
+
+
+def test_a_cell_too_long_to_be_one_is_refused_with_its_line():
+    text = "name,x,y,z,px,py,image,crs\na,1,2,3,4,5,a.jpg,EPSG:32615\n" + "x" * 200_000 + ",1,2,3,4,5,a.jpg,EPSG:32615"
+    with pytest.raises(JaxbaError, match="line 3: has 1 columns where the header has 8"):
+        parse_control(text)

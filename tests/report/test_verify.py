@@ -238,6 +238,10 @@ def word(rows: list[list[str]]) -> None:
     rows[4][4] = "good"
 
 
+def endless_cell(rows: list[list[str]]) -> None:
+    rows[4][4] = "1" * 200_000
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -245,6 +249,7 @@ def word(rows: list[list[str]]) -> None:
         (missing_column, "column error_px is missing"),
         (short_row, "line 5: 12 values in 13 columns"),
         (word, "column error_px: could not convert string to float: 'good'"),
+        (endless_cell, "line 5: field larger than field limit"),
     ],
 )
 def test_a_csv_of_another_form(export: Path, change: Callable[[list[list[str]]], None], message: str):

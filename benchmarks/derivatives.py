@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxba
-from jaxba.ba._compiled import compiled
+from jaxba.ba._descend import compiled
 from jaxba.ba._system import initial_unknowns, make_system, without_losses
 
 RESULTS = Path(__file__).parent / "results"

@@ -1,49 +1,116 @@
-"""Descend: the host's loop over a solver's compiled steps."""
+"""Descend: a solver compiled for the shapes of a system, once a process, and the host's loop over its steps.
 
+`jax.jit` keeps what it has compiled, but does not tell a first call's compile time from its running time; here the two
+are apart. jax's persistent cache, where it is switched on, keeps the result across processes.
+"""
+
+import functools
+import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
+from jax import Array
+from jaxtyping import Float
 
-from jaxba.ba._compiled import Compiled
+from jaxba.ba._compiler import compiler_options
+from jaxba.ba._linearise import cost
 from jaxba.ba._rows import Unknowns
 from jaxba.ba._solution import HistoryStep
-from jaxba.ba._solvers import RUNNING, State
-from jaxba.ba._system import System
+from jaxba.ba._solvers import RUNNING, AbstractSchurSolver, State
+from jaxba.ba._system import System, without_losses
+
+_KEPT = 32
+_SMALL = 3_000_000  # entries of all arrays
 
 
 class Reached(NamedTuple):
-    """Where the loop stopped and how it got there."""
+    """Where the loop stopped and how it got there.
+
+    - `plain_cost`: the cost of unknowns without the losses.
+    """
 
     unknowns: Unknowns
     state: State
     history: list[HistoryStep]
     interrupted: bool
+    plain_cost: Callable[[Unknowns], Float[Array, ""]]
+    seconds_compile: float
+    seconds_solve: float
 
 
 def descend(
-    run: Compiled,
-    unknowns: Unknowns,
+    solver: AbstractSchurSolver,
+    start: Unknowns,
     system: System,
     max_nfev: int,
     callback: Callable[[HistoryStep], None] | None = None,
 ) -> Reached:
     """Step until the solver has converged or `max_nfev` steps were tried; Ctrl-C ends it with what was reached."""
-    started = time.perf_counter()
-    state: State = run.init(unknowns, system)
+    begun = time.perf_counter()
+    plain: System = jax.device_put(without_losses(system))
+    run = compiled(solver, start, system, plain)
+    compiled_at = time.perf_counter()
+    unknowns, state = start, run.init(start, system)
     history = [HistoryStep(step=0, seconds=0.0, cost=float(state.cost), accepted=True, trust=float(state.trust))]
     interrupted = False
     try:
         while int(state.status) == RUNNING and len(history) <= max_nfev:
             reached = run.step(unknowns, state, system)
-            entry = _history_step(len(history), started, jax.device_get(reached[1]))
+            entry = _history_step(len(history), compiled_at, jax.device_get(reached[1]))
             (unknowns, state), _ = reached, history.append(entry)
             if callback is not None:
                 callback(history[-1])
     except KeyboardInterrupt:
         interrupted = True
-    return Reached(unknowns, state, history, interrupted)
+    seconds = compiled_at - begun, time.perf_counter() - compiled_at
+    return Reached(unknowns, state, history, interrupted, functools.partial(run.cost, plain), *seconds)
+
+
+class Compiled(NamedTuple):
+    """Compiled functions: `init(unknowns, system)`, `step(unknowns, state, system)` and `cost(system, unknowns)`."""
+
+    init: jax.stages.Compiled
+    step: jax.stages.Compiled
+    cost: jax.stages.Compiled
+
+
+def compiled(solver: AbstractSchurSolver, unknowns: Unknowns, system: System, plain: System) -> Compiled:
+    """Return the solver's functions for these arguments' shapes; `plain` is the system without robust losses."""
+    leaves, structure = jax.tree.flatten((unknowns, system, plain))
+    shapes = tuple((leaf.shape, leaf.dtype.name) for leaf in leaves)
+    return _compile(solver, structure, shapes)
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _compile(solver: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]) -> Compiled:
+    arguments = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
+    unknowns, system, plain = jax.tree.unflatten(structure, arguments)
+
+    def init(unknowns: Unknowns, system: System) -> State:
+        return solver.init(None, unknowns, system, None, None, None, frozenset())
+
+    def step(unknowns: Unknowns, state: State, system: System) -> tuple[Unknowns, State]:
+        return solver.step(None, unknowns, system, None, state, frozenset())[:2]
+
+    def plain_cost(system: System, unknowns: Unknowns) -> Float[Array, ""]:
+        return cost(system, unknowns)
+
+    state = eqx.filter_eval_shape(init, unknowns, system)
+    lowered = (
+        jax.jit(step).lower(unknowns, state, system),
+        jax.jit(init).lower(unknowns, system),
+        jax.jit(plain_cost).lower(plain, unknowns),
+    )
+    # the steps of a large program run long enough to pay for the optimisations
+    small = sum(math.prod(shape) for shape, _ in shapes) < _SMALL
+    options = compiler_options() if small else {}
+    with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
+        of_step, of_init, of_cost = pool.map(lambda one: one.compile(compiler_options=options), lowered)
+    return Compiled(init=of_init, step=of_step, cost=of_cost)
 
 
 def _history_step(step: int, started: float, state: State) -> HistoryStep:

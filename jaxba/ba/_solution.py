@@ -2,9 +2,9 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
@@ -107,6 +107,27 @@ class Solution(eqx.Module):
     num_steps: Int[Array | np.ndarray, ""]
     report: Report | None = eqx.field(static=True, default=None)
 
+    @staticmethod
+    def of(
+        problem: Problem,
+        values: Unknowns,
+        costs: Sequence[Float[Array | np.ndarray, ""]],
+        status: Int[Array | np.ndarray, ""],
+        num_steps: Int[Array | np.ndarray, ""],
+        report: Report | None = None,
+    ) -> "Solution":
+        """Return the solution of these values, in the problem's order; `costs` are the four, in the fields' order."""
+        return Solution(
+            values.poses,
+            type(problem.cameras).from_parameters(values.intrinsics),
+            values.points,
+            values.lever_arm,
+            *costs,
+            status=status,
+            num_steps=num_steps,
+            report=report,
+        )
+
     @property
     def result(self) -> str:
         """One of ftol, xtol, gtol (converged), max_nfev, stuck, not_finite, interrupted."""
@@ -131,8 +152,3 @@ class Solution(eqx.Module):
             return p.poses, p.cameras, p.points, p.lever_arm
 
         return eqx.tree_at(unknowns, problem, (self.poses, self.cameras, self.points, self.lever_arm))
-
-
-def to_host(tree: Unknowns) -> Unknowns:
-    """Return the unknowns with numpy arrays in place of jax's."""
-    return jax.tree.map(np.asarray, tree)

@@ -16,15 +16,13 @@ from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._adjoint import Adjoint
-from jaxba.ba._check import prepare
-from jaxba.ba._compiled import compiled
 from jaxba.ba._descend import descend
-from jaxba.ba._plan import LinearSolver, Plan, make_plan
+from jaxba.ba._plan import LinearSolver, Plan
 from jaxba.ba._problem import Problem
 from jaxba.ba._rows import Unknowns
-from jaxba.ba._solution import HistoryStep, Report, Solution, to_host
+from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solvers import AbstractSchurSolver, SchurDogleg, SchurLevenbergMarquardt
-from jaxba.ba._system import System, initial_unknowns, is_traced, make_system, restore, without_losses
+from jaxba.ba._system import System, initial_unknowns, is_traced, make_system, restore, structured
 from jaxba.ba._traced import solve_traced
 from jaxba.geometry import AbstractLoss, Linear
 
@@ -97,39 +95,25 @@ def _solve_on_host(
     dtype: Any,
     callback: Callable[[HistoryStep], None] | None,
 ) -> Solution:
-    begin = time.perf_counter()
-    prepared = prepare(problem)
-    if plan is None or prepared.dropped.any():
-        like = None if plan is None else plan.shape
-        plan = make_plan(prepared.problem, linear_solver=linear_solver, like=like)
-    system: System = jax.device_put(make_system(prepared.problem, plan, loss, dtype))
-    plain: System = jax.device_put(without_losses(system))
-    start: Unknowns = jax.device_put(initial_unknowns(prepared.problem, plan, dtype))
-    ready = time.perf_counter()
-    run = compiled(solver, start, system, plain)
-    started = time.perf_counter()
-    unknowns, state, history, interrupted = descend(run, start, system, max_nfev, callback)
+    begun = time.perf_counter()
+    prepared, plan = structured(problem, plan, linear_solver)
+    problem = prepared.problem
+    system: System = jax.device_put(make_system(problem, plan, loss, dtype))
+    start: Unknowns = jax.device_put(initial_unknowns(problem, plan, dtype))
+    seconds_setup = time.perf_counter() - begun
+    reached = descend(solver, start, system, max_nfev, callback)
     report = Report(
-        history=tuple(history),
+        history=tuple(reached.history),
         dropped=prepared.dropped,
-        seconds_setup=ready - begin,
-        seconds_compile=started - ready,
-        seconds_solve=time.perf_counter() - started,
+        seconds_setup=seconds_setup,
+        seconds_compile=reached.seconds_compile,
+        seconds_solve=reached.seconds_solve,
         linear_solver=plan.shape.linear_solver,
-        interrupted=interrupted,
-        problem=prepared.problem,
+        interrupted=reached.interrupted,
+        problem=problem,
     )
-    values = restore(to_host(unknowns), prepared.problem, plan)
-    return Solution(
-        poses=values.poses,
-        cameras=type(problem.cameras).from_parameters(values.intrinsics),
-        points=values.points,
-        lever_arm=values.lever_arm,
-        initial_cost=np.asarray(history[0].cost),
-        final_cost=np.asarray(state.cost),
-        initial_plain_cost=np.asarray(run.cost(plain, start)),
-        plain_cost=np.asarray(run.cost(plain, unknowns)),
-        status=np.asarray(state.status),
-        num_steps=np.asarray(len(history) - 1),
-        report=report,
-    )
+    plain = reached.plain_cost
+    costs = reached.history[0].cost, reached.state.cost, plain(start), plain(reached.unknowns)
+    on_host = jax.tree.map(np.asarray, (reached.unknowns, costs, reached.state.status, reached.state.num_steps))
+    unknowns, costs, status, num_steps = on_host
+    return Solution.of(problem, restore(unknowns, problem, plan), costs, status, num_steps, report)

@@ -1,7 +1,8 @@
 """System: a problem in the solver's own order and padded shapes, the one argument of every compiled function.
 
-`make_system` moves values from the problem into the layout of its plan; `initial_unknowns` and `restore` move unknowns
-in and out. On the host this is numpy, so nothing compiles for a shape that is not a bucket's; with tracers it is jax.
+`structured` finds what can be solved, and its plan; `make_system` moves values from the problem into the layout of the
+plan; `initial_unknowns` and `restore` move unknowns in and out. On the host this is numpy, so nothing compiles for a
+shape that is not a bucket's; with tracers it is jax.
 """
 
 import dataclasses
@@ -15,7 +16,8 @@ from jax import Array
 from jax.core import Tracer
 from jaxtyping import Float, Int
 
-from jaxba.ba._plan import ROW_RUN, Plan, Shape, bucket
+from jaxba.ba._check import Prepared, prepare
+from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, Shape, bucket, make_plan
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._rows import Step, Unknowns
 from jaxba.ba.groups import Reprojection
@@ -42,6 +44,19 @@ class System(eqx.Module):
     block_row: Int[Array | np.ndarray, " blocks"]
     block_column: Int[Array | np.ndarray, " blocks"]
     shape: Shape = eqx.field(static=True)
+
+
+def structured(problem: Problem, plan: Plan | None, linear_solver: LinearSolver) -> tuple[Prepared, Plan]:
+    """Return what can be solved of a problem whose values are known, and its plan.
+
+    A plan that was given stands unless something was left out; then its shape gives the least sizes of a new one.
+    Raises `JaxbaError` as `prepare` does.
+    """
+    prepared = prepare(problem)
+    if plan is None or prepared.dropped.any():
+        like = None if plan is None else plan.shape
+        plan = make_plan(prepared.problem, linear_solver=linear_solver, like=like)
+    return prepared, plan
 
 
 def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = np.float64) -> System:

@@ -20,8 +20,6 @@ from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._adjoint import Adjoint, Found, optimum, polish
-from jaxba.ba._check import prepare
-from jaxba.ba._compiled import compiled
 from jaxba.ba._descend import descend
 from jaxba.ba._gauge import require_gauge
 from jaxba.ba._linearise import costs
@@ -30,7 +28,7 @@ from jaxba.ba._problem import Problem
 from jaxba.ba._rows import Unknowns
 from jaxba.ba._solution import HistoryStep, Solution
 from jaxba.ba._solvers import AbstractSchurSolver, SchurLevenbergMarquardt, residuals
-from jaxba.ba._system import System, initial_unknowns, is_traced, make_system, restore, without_losses
+from jaxba.ba._system import System, initial_unknowns, is_traced, make_system, restore, structured
 from jaxba.geometry import AbstractLoss
 
 _NOT_DOUBLE = (
@@ -57,8 +55,7 @@ def solve_traced(
     def forward(system: System, start: Unknowns) -> Found:
         if is_traced((system, start)):
             return _descend_traced(system, start, solver, max_nfev, optx.ImplicitAdjoint())
-        run = compiled(solver, start, system, jax.device_put(without_losses(system)))
-        reached = descend(run, start, system, max_nfev, callback)
+        reached = descend(solver, start, system, max_nfev, callback)
         if reached.interrupted:
             raise KeyboardInterrupt
         return Found(reached.unknowns, reached.state.status, reached.state.num_steps)
@@ -77,7 +74,7 @@ def solve_traced(
         else:
             found = optimum(system, start, forward=forward, exact=adjoint == "implicit", require=require)
         values, costs = _result(system, start, found.unknowns, problem, plan)
-    return _solution(problem, found, values, costs)
+    return Solution.of(problem, values, costs, found.status, found.num_steps)
 
 
 def solve_to_the_last_digits(
@@ -86,37 +83,18 @@ def solve_to_the_last_digits(
     """Return the optimum to rounding: the solver's own end, then Newton steps. Needs float64 switched on."""
     solver = SchurLevenbergMarquardt(rtol=ftol, atol=gtol, xtol=xtol)
     system, start = _lay_out(problem, plan, loss, np.float64)
-    run = compiled(solver, start, system, jax.device_put(without_losses(system)))
-    reached = descend(run, start, system, max_nfev)
+    reached = descend(solver, start, system, max_nfev)
     unknowns = reached.unknowns
     for _ in range(3):
         unknowns = polish(system, unknowns)
     values, costs = _result(system, start, unknowns, problem, plan)
-    return _solution(problem, Found(unknowns, reached.state.status, reached.state.num_steps), values, costs)
-
-
-def _solution(problem: Problem, found: Found, values: Unknowns, costs: tuple[Float[Array, ""], ...]) -> Solution:
-    return Solution(
-        poses=values.poses,
-        cameras=type(problem.cameras).from_parameters(values.intrinsics),
-        points=values.points,
-        lever_arm=values.lever_arm,
-        initial_cost=costs[0],
-        final_cost=costs[1],
-        initial_plain_cost=costs[2],
-        plain_cost=costs[3],
-        status=found.status,
-        num_steps=found.num_steps,
-    )
+    return Solution.of(problem, values, costs, reached.state.status, reached.state.num_steps)
 
 
 def _structure(problem: Problem, plan: Plan | None, linear_solver: LinearSolver) -> tuple[Problem, Plan]:
     """Return the problem that can be solved, as far as its values are known, and its plan."""
     if not is_traced(problem):
-        prepared = prepare(problem)
-        if plan is None or prepared.dropped.any():
-            like = None if plan is None else plan.shape
-            plan = make_plan(prepared.problem, linear_solver=linear_solver, like=like)
+        prepared, plan = structured(problem, plan, linear_solver)
         return prepared.problem, plan
     indices = (problem.observations.image_index, problem.observations.point_index, problem.camera_index, problem.free)
     if plan is None:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import hypothesis
 import jax
 import jaxtyping
 import pytest
@@ -31,6 +32,9 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     ):
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
+# the same examples each time, however long one takes on a machine that is busy
+hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
+hypothesis.settings.load_profile("tests")
 jaxtyping.install_import_hook("jaxba", "beartype.beartype")  # works only on modules that are not imported yet
 
 

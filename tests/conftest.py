@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import hypothesis
 import jax
 import jaxtyping
 import pytest
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 sys.path += [str(folder) for folder in (Path(__file__).parent, *sorted(Path(__file__).parent.glob("[a-z]*/")))]
 jax.config.update("jax_enable_x64", True)
 use_compilation_cache()
+# the same examples each time, however long one takes on a machine that is busy
+hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
+hypothesis.settings.load_profile("tests")
 jaxtyping.install_import_hook("jaxba", "beartype.beartype")  # works only on modules that are not imported yet
 
 

@@ -1,1 +1,1 @@
-"""Benchmarks: `python -m benchmarks.run` prints every table of the README."""
+"""Benchmarks: one command each; `benchmarks/README.md` has every table with its command, commit and machine."""

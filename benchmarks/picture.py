@@ -1,4 +1,4 @@
-"""The README's picture: `python -m benchmarks.picture` writes benchmarks/results/block.png.
+"""The picture of benchmarks/README.md: `python -m benchmarks.picture` writes benchmarks/results/block.png.
 
 Left, a block of 100 photos with 2% wrong matches, adjusted with Huber's loss: the errors of the adjusted camera
 positions against the truth, and the ellipses that the adjustment predicts for them (95%). Right, how the cost falls

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -147,14 +148,8 @@ def _links_in(
 
 def _joined(tracks: Tracks, links: _Links) -> Tracks:
     """Return the tracks with links added, the nearest descriptors first, never two features of one image in a track."""
-    parent = np.arange(tracks.num_tracks)
-
-    def root(track: int) -> int:
-        while parent[track] != track:
-            parent[track] = parent[parent[track]]
-            track = int(parent[track])
-        return track
-
+    linked = np.unique(np.concatenate([links.track, links.owner[links.owner >= 0]])).tolist()
+    joined = DisjointSet(linked)
     images: dict[int, set[int]] = {}
 
     def images_of(track: int) -> set[int]:
@@ -165,19 +160,20 @@ def _joined(tracks: Tracks, links: _Links) -> Tracks:
 
     added = []
     for k in np.lexsort((links.feature, links.image, links.track, links.distance)):
-        own = root(int(links.track[k]))
+        own = joined[int(links.track[k])]
         if links.owner[k] < 0:
             if int(links.image[k]) not in images_of(own):
                 images_of(own).add(int(links.image[k]))
                 added.append(k)
             continue
-        other = root(int(links.owner[k]))
-        if own != other and not images_of(own) & images_of(other):
-            first, second = min(own, other), max(own, other)
-            images[first] = images_of(own) | images_of(other)
-            parent[second] = first
-    roots = np.array([root(track) for track in range(tracks.num_tracks)], dtype=np.int64)
-    track = np.concatenate([roots[tracks.track_index], roots[links.track[added]]])
+        other = joined[int(links.owner[k])]
+        if own != other and images_of(own).isdisjoint(images_of(other)):
+            joined.merge(own, other)
+            images[joined[own]] = images_of(own) | images_of(other)
+    lowest: dict[int, int] = {}  # track of each of the joined ones, which lends them its place and colour
+    place = np.arange(tracks.num_tracks)
+    place[linked] = [lowest.setdefault(joined[track], track) for track in linked]
+    track = np.concatenate([place[tracks.track_index], place[links.track[added]]])
     image = np.concatenate([tracks.image_index, links.image[added].astype(tracks.image_index.dtype)])
     feature = np.concatenate([tracks.feature_index, links.feature[added].astype(tracks.feature_index.dtype)])
     order = np.lexsort((image, track))

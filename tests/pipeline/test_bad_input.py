@@ -13,7 +13,7 @@ from PIL import Image
 from small_survey import NUM_PHOTOS, Survey
 
 from jaxba import JaxbaError
-from jaxba.engine import changed
+from jaxba.engine import _store as store, changed
 from jaxba.pipeline import PIPELINE, Run
 
 SAME_PLACE = ("crs.min_positions=1",)

@@ -1,4 +1,4 @@
-"""The schema of `tile.npz`: each array's name, shape, type, unit and frame, in one table for the reader and the README.
+"""The schema of `tile.npz`: each array's name, shape, type, unit and frame, in one table for reader and README.
 
 A tile holds every part of a `Problem` in plain arrays, so that any program can write one with `numpy.savez` alone.
 Shapes are symbolic: images, cameras, points, observations, and parameters (of the camera model). The arrays of priors
@@ -155,7 +155,7 @@ def loss_specs(name: str) -> tuple[ArraySpec, ...]:
 
 
 def schema_markdown() -> str:
-    """Return the schema as a table in markdown, for the README.
+    """Return the schema as a table in markdown, for the README of `jaxba.io`.
 
     >>> print(schema_markdown().splitlines()[0])
     | array | shape | dtype | unit | frame | default | meaning |

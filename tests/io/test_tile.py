@@ -13,10 +13,9 @@ import pytest
 from jaxba._errors import JaxbaError
 from jaxba.ba import PRIORS, Free, Observations, PositionPrior, Problem
 from jaxba.geometry import BAL, CAMERAS, LOSSES, Barron, Cauchy, Linear, Pose, SimpleRadial
-from jaxba.io import SCHEMA, read_problem, read_tile, schema_markdown, write_bal, write_tile
+from jaxba.io import SCHEMA, read_problem, read_tile, write_bal, write_tile
 from jaxba.io._schema import all_specs, prior_specs
 
-ROOT = Path(__file__).parents[2]
 IMAGES, CAMERA_COUNT, POINTS, OBSERVATIONS = 4, 2, 5, 9
 
 
@@ -303,10 +302,3 @@ def test_schema_has_every_array_once_with_a_meaning_and_units_where_there_are_nu
         assert spec.meaning
         assert spec.unit or spec.kind != "float64", f"{spec.name}: give its unit in _PRIOR_FIELDS"
     assert {spec.name for spec in SCHEMA} <= set(names)
-
-
-def test_table_of_the_readme_is_the_schema():
-    readme = ROOT / "README.md"
-    if not readme.exists():
-        pytest.skip("needs README.md, which is not in this copy")
-    assert schema_markdown() in readme.read_text(), "paste the output of jaxba.io.schema_markdown() into README.md"

@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +18,14 @@ from jaxba.cli._result import Run, facts, summary
 from jaxba.cli._text import to_json
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.geometry import LOSSES, AbstractLoss, Barron
-from jaxba.io import read_problem, refuse_same_file, what_bal_cannot_hold, write_bal, write_tile
+from jaxba.io import (
+    read_problem,
+    refuse_same_file,
+    refuse_unwritable,
+    what_bal_cannot_hold,
+    write_bal,
+    write_tile,
+)
 
 NOT_CONVERGED, INTERRUPTED = 1, 130
 _ROUNDS = 2
@@ -139,16 +145,7 @@ def _check_numbers(options: SolveOptions) -> None:
 
 def _check_output(out: Path, given: Problem) -> None:
     """Refuse, before a solve that may take minutes, an output that cannot be written after it."""
-    folder = Path(os.path.realpath(out)).parent
-    if out.is_dir():
-        raise JaxbaError(f"{out}: cannot be written, it is a folder: add a file name.")
-    if not folder.is_dir():
-        raise JaxbaError(f"{out}: cannot be written, there is no folder {folder}: create it, or choose another place.")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise JaxbaError(
-            f"{out}: cannot be written, the folder may not be written to: choose another place (--out), or change its "
-            "permissions."
-        )
+    refuse_unwritable(out)
     if out.name.endswith(_BAL_ENDINGS):
         lost = what_bal_cannot_hold(given)
         if lost:

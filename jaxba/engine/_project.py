@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxba._errors import JaxbaError
-from jaxba.engine._store import cannot_write, remove_leftovers, sha256
+from jaxba.engine._store import sha256
+from jaxba.io import cannot_write, remove_leftovers, write_atomically
 from jaxba.scene import PhotoFile
 
 SETTINGS, SUMMARY = "jaxba.toml", "summary.json"
@@ -99,16 +100,11 @@ class Project:
     def write_text(self, name: str, text: str) -> None:
         """Write a text file of the project, whole or not at all, where it changes."""
         path = self.folder / name
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
         with contextlib.suppress(OSError):
             if path.read_bytes() == text.encode():
                 return
-        try:
-            partial.write_bytes(text.encode())
-            partial.replace(path)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            raise cannot_write(path, error) from error
+        with write_atomically(path) as file:
+            file.write(text.encode())
 
     def read_json(self, name: str) -> object:
         """Return the content of a JSON file of the project; None where there is none or it is damaged."""

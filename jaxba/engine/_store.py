@@ -6,12 +6,10 @@ they are read: opening a block of 100 MB costs a millisecond, and the features o
 are looked at. Checking those of 500 photos (600 MB) takes under a second.
 """
 
-import errno
 import functools
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,11 +22,11 @@ from jaxtyping import AbstractArray
 from jaxba._errors import JaxbaError
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.engine._key import Key
+from jaxba.io import write_folder_atomically
 
 T = TypeVar("T")
 _RECORD = "record.json"
 _ARRAY = "__npy__"
-_PARTIAL, _OLD = ".partial", ".old"
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Record:
 def save(folder: Path, value: Any, key: Key) -> Record:
     """Write a dataclass as a folder, in place of what was there; return its record."""
     record = Record(key, fingerprint(value))
-    with written_whole(folder) as partial:
+    with write_folder_atomically(folder) as partial:
         tree = _arrays_to_files(_converter().unstructure(value), partial, "")
         _write_record(partial, record, tree)
     return record
@@ -55,7 +53,7 @@ def save(folder: Path, value: Any, key: Key) -> Record:
 def save_failure(folder: Path, reason: str, key: Key) -> Record:
     """Write that nothing could be made and why, so that the next run need not try again."""
     record = Record(key, fingerprint(reason), reason)
-    with written_whole(folder) as partial:
+    with write_folder_atomically(folder) as partial:
         _write_record(partial, record, None)
     return record
 
@@ -124,55 +122,6 @@ class Stored(Mapping[int, T]):
         """Return some of the photos', counted anew from 0 in the order given."""
         folders = {row: self.folders[i] for row, i in enumerate(indices)}
         return Stored(self.cls, self.field, folders, {row: self.digests[i] for row, i in enumerate(indices)})
-
-
-class written_whole:
-    """A folder under a temporary name that takes its place when the block ends well."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.partial = folder.with_name(f".{folder.name}.{os.getpid()}{_PARTIAL}")
-        self.old = folder.with_name(f".{folder.name}.{os.getpid()}{_OLD}")
-
-    def __enter__(self) -> Path:
-        shutil.rmtree(self.partial, ignore_errors=True)
-        try:
-            self.partial.mkdir(parents=True)
-        except OSError as error:
-            raise cannot_write(self.folder, error) from error
-        return self.partial
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        if error is not None:
-            shutil.rmtree(self.partial, ignore_errors=True)
-            if isinstance(error, OSError):
-                raise cannot_write(self.folder, error) from error
-            return
-        if self.folder.exists():
-            shutil.rmtree(self.old, ignore_errors=True)
-            self.folder.rename(self.old)
-        self.partial.rename(self.folder)
-        shutil.rmtree(self.old, ignore_errors=True)
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Remove what a process that was killed left beside the folders in a folder; no other process may be writing."""
-    for place in folder.glob(".*"):
-        if place.name.endswith((_PARTIAL, _OLD)):
-            shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
-
-
-def cannot_write(path: Path, error: OSError) -> JaxbaError:
-    """Return the error that says why a file could not be written and what to do."""
-    cures = {
-        errno.ENOSPC: "the disk is full; free space and run again, what is done is kept",
-        errno.EDQUOT: "the quota is used up; free space and run again, what is done is kept",
-        errno.EACCES: "it may not be written to; choose another --out or change its permissions",
-        errno.EPERM: "it may not be written to; choose another --out or change its permissions",
-        errno.EROFS: "the file system is read-only; choose another --out",
-    }
-    other = f"cannot be written ({error.strerror or error}); choose another --out"
-    return JaxbaError(f"{path}: {cures.get(error.errno or 0, other)}.")
 
 
 def _write_record(folder: Path, record: Record, tree: Any) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.io._atomic import write_atomically
+from jaxba.io._atomic import cannot_write, write_atomically
 from jaxba.scene import Block
 
 _MODEL_IDS = {
@@ -217,6 +217,6 @@ def _write(folder: str | os.PathLike[str], name: str, content: bytes) -> None:
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise JaxbaError(f"{os.fspath(folder)}: cannot be made, {error.strerror}; choose another place.") from error
+        raise cannot_write(folder, error) from error
     with write_atomically(Path(folder) / name) as file:
         file.write(content)

@@ -24,6 +24,7 @@ from jaxba.engine._settings import Settings, to_toml
 from jaxba.engine._stage import Stage, left_out
 from jaxba.engine._work import Work, collected, failures, run_one, why_to_do, without_path, works
 from jaxba.engine._workers import Resources, memory_for
+from jaxba.io import write_folder_atomically
 from jaxba.pipeline._done import Done
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._stages import NAMES, STAGES
@@ -135,7 +136,7 @@ def _run_stage(
 
 def _run_whole(project: Project, stage: Stage, item: Work, params: Parameters) -> None:
     if stage.writes_files:
-        with _store.written_whole(project.export) as partial:
+        with write_folder_atomically(project.export) as partial:
             outputs = stage.module.run(replace(item.inputs, folder=partial), params)
     else:
         outputs = stage.module.run(item.inputs, params)

@@ -33,7 +33,7 @@ from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.geo import geodetic_from_local, projected_from_local
 from jaxba.geometry import OpenCV
-from jaxba.io import write_atomically
+from jaxba.io import cannot_write, write_atomically
 from jaxba.scene import Attitude
 from jaxba.simulation import PhotoTags, expose, ground_points, jpeg_with_tags, paint_ground, pixel_rays, render
 from jaxba.simulation._flight import Terrain, smooth_terrain
@@ -112,7 +112,7 @@ def write_survey(folder: str | os.PathLike[str], params: Params) -> Written:
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise JaxbaError(f"{target.parent}: cannot be made, {error.strerror}; choose another place.") from error
+            raise cannot_write(target.parent, error) from error
         with write_atomically(target) as file:
             file.write(content)
         num_bytes += len(content)

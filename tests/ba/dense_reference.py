@@ -2,17 +2,21 @@
 
 `Dense` writes a problem as one function of one flat tangent vector, from `camera.project`, `Pose.transform`,
 `Pose.retract` and the priors' `residual` alone: nothing of the solver's order, padding, blocks or derivatives.
-Everything that follows from it (Jacobian, normal equations, scipy's optimum) is dense.
+Everything that follows from it (Jacobian, normal equations, scipy's optimum) is dense. One program serves all problems
+of the same sizes, whatever of them is free and whatever their losses.
 """
 
-from typing import NamedTuple
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 from jax import Array
+from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 
 from jaxba.ba import Problem, Step, Unknowns
@@ -25,7 +29,7 @@ from jaxba.geometry import AbstractLoss, Linear, Pose
 def start_of(problem: Problem) -> Unknowns:
     """Return a problem's start values in its own order."""
     parameters = np.stack([getattr(problem.cameras, name) for name in problem.cameras.parameter_names()], axis=-1)
-    return jax.tree.map(jnp.asarray, Unknowns(problem.poses, parameters, problem.lever_arm, problem.points))
+    return Unknowns(problem.poses, parameters, problem.lever_arm, problem.points)
 
 
 def solver_view(
@@ -63,22 +67,24 @@ def minimise(
 ) -> Minimum:
     """Run the solver step by step from the problem's start values, at most 300 steps."""
     plan, system, unknowns = solver_view(problem, loss, linear_solver)
-    state = _init(solver, unknowns, system)
+    init, step = _init_and_step(solver)
+    state = init(unknowns, system)
     for _ in range(300):
-        unknowns, state = _step(solver, unknowns, state, system)
+        unknowns, state = step(unknowns, state, system)
         if int(state.status) != RUNNING:
             break
-    return Minimum(restore(unknowns, problem, plan), state, plan)
+    return Minimum(jax.device_get(restore(unknowns, problem, plan)), jax.device_get(state), plan)
 
 
-@eqx.filter_jit
-def _init(solver: AbstractSchurSolver, unknowns: Unknowns, system: System) -> State:
-    return solver.init(None, unknowns, system, None, None, None, frozenset())
+@functools.cache
+def _init_and_step(solver: AbstractSchurSolver) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    def init(unknowns: Unknowns, system: System) -> State:
+        return solver.init(None, unknowns, system, None, None, None, frozenset())
 
+    def step(unknowns: Unknowns, state: State, system: System) -> tuple[Unknowns, State]:
+        return solver.step(None, unknowns, system, None, state, frozenset())[:2]
 
-@eqx.filter_jit
-def _step(solver: AbstractSchurSolver, unknowns: Unknowns, state: State, system: System) -> tuple[Unknowns, State]:
-    return solver.step(None, unknowns, system, None, state, frozenset())[:2]
+    return quick_jit(init), quick_jit(step)
 
 
 class Group(NamedTuple):
@@ -105,11 +111,12 @@ class Dense:
             np.full(3, bool(free.lever_arm)),
             np.repeat(free.points[:, None], 3, axis=1),
         )
-        place = np.flatnonzero(np.concatenate([mask.ravel() for mask in self._masks]))
-        self.size = len(place)
+        self._place = np.flatnonzero(np.concatenate([mask.ravel() for mask in self._masks]))
+        self.size = len(self._place)
         self.lower = self._bound(-np.inf, problem.lower - start.intrinsics)
         self.upper = self._bound(np.inf, problem.upper - start.intrinsics)
-        self._values = jax.tree.map(jnp.asarray, (place, start, problem))
+        priors = tuple(dataclasses.replace(prior, loss=Linear()) for prior in problem.priors)
+        self._values = jax.tree.map(np.asarray, (start, dataclasses.replace(problem, priors=priors)))
         self._last: tuple[np.ndarray, list[Group]] | None = None
 
     def _bound(self, default: float, intrinsics: Array) -> np.ndarray:
@@ -121,14 +128,9 @@ class Dense:
         leaves = step.poses, step.intrinsics, step.lever_arm, step.points
         return np.concatenate([np.asarray(leaf)[mask] for leaf, mask in zip(leaves, self._masks, strict=True)])
 
-    def unknowns(self, vector: np.ndarray) -> Unknowns:
-        """Return the unknowns at a tangent vector, in the problem's order."""
-        place, start, _ = self._values
-        return _moved(jnp.asarray(vector), place, start)
-
     def tangent(self, unknowns: Unknowns) -> np.ndarray:
         """Return the tangent vector that leads to unknowns in the problem's order."""
-        start = self._values[1]
+        start = self._values[0]
         turn = _scipy(unknowns.poses) * _scipy(start.poses).inv()
         moved = np.array(unknowns.poses.translation) - turn.apply(np.array(start.poses.translation))
         return self.flat(
@@ -144,9 +146,11 @@ class Dense:
         """Return residuals and Jacobians of every group, by `jax.jacfwd` of the whole."""
         vector = np.zeros(self.size) if vector is None else vector
         if self._last is None or not np.array_equal(self._last[0], vector):  # scipy asks for values, then derivatives
-            jacobians, residuals = _derivatives(jnp.asarray(vector), *self._values)
+            full = np.zeros(sum(mask.size for mask in self._masks))
+            full[self._place] = vector
+            jacobians, residuals = jax.device_get(_derivatives(full, *self._values))
             rows = zip(residuals, jacobians, self.losses, strict=True)
-            self._last = vector.copy(), [Group(np.asarray(r), np.asarray(j), loss) for r, j, loss in rows]
+            self._last = vector.copy(), [Group(r, j[:, :, self._place], loss) for r, j, loss in rows]
         return self._last[1]
 
     def cost(self, vector: np.ndarray) -> float:
@@ -201,18 +205,25 @@ def _root(rho: np.ndarray, residual: np.ndarray) -> np.ndarray:
 
 def _rho(loss: AbstractLoss, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rho and its slope at every row."""
-    rho, slope, _ = _loss_derivatives(loss, jnp.sum(jnp.asarray(residual) ** 2, axis=1))
-    return np.asarray(rho), np.asarray(slope)
+    return loss_derivatives(loss, np.sum(residual**2, axis=1))[:2]
 
 
-@eqx.filter_jit
-def _loss_derivatives(loss: AbstractLoss, squared: Array) -> tuple[Array, ...]:
-    return loss.derivatives(squared)
+_LOSS_ROWS = 4096
 
 
-def _moved(vector: Array, place: Array, start: Unknowns) -> Unknowns:
+def loss_derivatives(loss: AbstractLoss, squared: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rho, its slope and its curvature of squared norms, at most `_LOSS_ROWS` of them."""
+    padded = np.zeros(_LOSS_ROWS)
+    padded[: len(squared)] = squared
+    rho, slope, curvature = jax.device_get(_loss_derivatives(jax.tree.map(np.asarray, loss), padded))
+    return rho[: len(squared)], slope[: len(squared)], curvature[: len(squared)]
+
+
+_loss_derivatives = quick_jit(lambda loss, squared: loss.derivatives(squared))
+
+
+def _moved(full: Array, start: Unknowns) -> Unknowns:
     sizes = start.poses.translation.shape[0] * 6, start.intrinsics.size, 3, start.points.size
-    full = jnp.zeros(sum(sizes)).at[place].set(vector)
     poses, intrinsics, lever_arm, points = jnp.split(full, np.cumsum(sizes)[:-1])
     return Unknowns(
         start.poses.retract(poses.reshape(-1, 6)),
@@ -222,9 +233,9 @@ def _moved(vector: Array, place: Array, start: Unknowns) -> Unknowns:
     )
 
 
-def _residuals(vector: Array, place: Array, start: Unknowns, problem: Problem) -> tuple[tuple, tuple]:
+def _residuals(full: Array, start: Unknowns, problem: Problem) -> tuple[tuple, tuple]:
     """Return the residuals of every group, (rows, components), twice: to differentiate, and to keep."""
-    unknowns, seen = _moved(vector, place, start), problem.observations
+    unknowns, seen = _moved(full, start), problem.observations
     pose = Pose(unknowns.poses.quaternion[seen.image_index], unknowns.poses.translation[seen.image_index])
     camera = type(problem.cameras).from_parameters(unknowns.intrinsics[problem.camera_index[seen.image_index]])
     pixel = camera.project(pose.transform(unknowns.points[seen.point_index]))
@@ -233,4 +244,4 @@ def _residuals(vector: Array, place: Array, start: Unknowns, problem: Problem) -
 
 
 # the problem is an argument, not a constant: one compilation serves all problems of the same shapes
-_derivatives = eqx.filter_jit(jax.jacfwd(_residuals, has_aux=True))
+_derivatives = quick_jit(jax.jacfwd(_residuals, has_aux=True))

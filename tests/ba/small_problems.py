@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 
 from jaxba.ba import (
@@ -54,8 +55,8 @@ RADIAL = EVERY_CAMERA[3]
 class OneOf(AbstractLoss):
     """The loss at `index` of `LOSSES`, chosen at run time, so that one compilation serves all of them."""
 
-    index: Array
-    f_scale: Array
+    index: Array | np.ndarray
+    f_scale: Array | np.ndarray
 
     def rho(self, z: Array) -> Array:
         # a number among numbers: the solver's systems hold losses as floats
@@ -71,7 +72,10 @@ LOSSES = (
 
 def one_of(index: int) -> OneOf:
     """Return `LOSSES[index]` as a loss that shares its compilation with the others."""
-    return OneOf(jnp.array(float(index)), jnp.array(LOSSES[index].f_scale, float))
+    return OneOf(np.array(float(index)), np.array(LOSSES[index].f_scale, float))
+
+
+_project = quick_jit(lambda camera, point_in_cam: camera.project(point_in_cam))
 
 
 def small_problem(
@@ -118,7 +122,7 @@ def small_problem(
     image_index, point_index = image_index[kept], point_index[kept]
     in_cam = attitudes[image_index].apply(points[point_index] - centers[image_index])
     of_row = type(camera)(*true_parameters[camera_index[image_index]].T)
-    xy_px = np.asarray(of_row.project(jnp.asarray(in_cam))) + 0.5 * rng.normal(size=(len(image_index), 2))
+    xy_px = np.asarray(_project(of_row, in_cam)) + 0.5 * rng.normal(size=(len(image_index), 2))
     outliers = rng.permutation(len(xy_px))[:num_outliers]
     xy_px[outliers] += 30 * rng.normal(size=(num_outliers, 2))
 

@@ -7,6 +7,7 @@ import pytest
 import scipy.optimize
 from dense_reference import solver_view
 from jax import Array
+from quick_jit import quick_jit
 from small_problems import EVERY_CAMERA, small_problem
 
 from jaxba.ba import Unknowns
@@ -21,16 +22,16 @@ def test_many_right_hand_sides_equal_numpy(linear_solver):
     problem = small_problem(EVERY_CAMERA[1], num_images=26, num_points=60, seen_by=3)
     _, system, start = solver_view(problem, linear_solver=linear_solver)
     shape = system.shape
-    rhs = jnp.asarray(np.random.default_rng(0).normal(size=(shape.num_images, shape.block, 7)))
+    rhs = np.random.default_rng(0).normal(size=(shape.num_images, shape.block, 7))
 
-    @jax.jit
-    def solved(system: System, start: Unknowns) -> tuple[Reduced, Array, Array]:
+    @quick_jit
+    def solved(system: System, start: Unknowns, rhs: Array) -> tuple[Reduced, Array, Array]:
         model = linearise(system, start)
         damping = jax.tree.map(lambda d: jnp.where(d > 0, 1e-4 * d, 1.0), model.diagonal)
         reduced = eliminate_points(system, model, damping)
         return reduced, *factor_solve(system, reduced, factorise(system, reduced), rhs)
 
-    reduced, solution, iterations = solved(system, start)
+    reduced, solution, iterations = jax.device_get(solved(system, start, rhs))
     blocks = np.zeros((shape.num_images, shape.block, shape.num_images, shape.block))
     for i, block in enumerate(np.asarray(reduced.diagonal)):
         blocks[i, :, i] = block
@@ -50,6 +51,10 @@ def test_many_right_hand_sides_equal_numpy(linear_solver):
     assert (iterations > 0) == (linear_solver == "cg")
 
 
+box_minima = quick_jit(jax.vmap(box_minimum))
+minimum_without_box = quick_jit(lambda matrix, rhs: box_minimum(matrix, rhs, None, None))
+
+
 @pytest.mark.parametrize("condition", [1e1, 1e4, 1e8])
 @pytest.mark.parametrize("size", [1, 3, 10])
 def test_box_minimum_equals_scipy(size, condition):
@@ -66,7 +71,7 @@ def test_box_minimum_equals_scipy(size, condition):
         upper.append(np.where(rng.uniform(size=size) < 0.3, np.inf, high))
     root, target, lower, upper = (np.array(a) for a in (roots, targets, lower, upper))
     matrix, rhs = np.swapaxes(root, 1, 2) @ root, np.einsum("nij,ni->nj", root, target)
-    found = np.asarray(jax.jit(jax.vmap(box_minimum))(matrix, rhs, lower, upper))
+    found = np.asarray(box_minima(matrix, rhs, lower, upper))
     assert np.all((found >= lower) & (found <= upper))
     reached = np.linalg.norm(np.einsum("nij,nj->ni", root, found) - target, axis=1) ** 2
     best = [
@@ -76,5 +81,5 @@ def test_box_minimum_equals_scipy(size, condition):
     # rounding of the squared matrix's entries, relative to |target|^2
     size_of_terms = np.linalg.norm(target, axis=1) ** 2
     np.testing.assert_array_less(reached - best, 1e-9 * size_of_terms)
-    unbounded = jax.jit(lambda m, b: box_minimum(m, b, None, None))(matrix[0], rhs[0])
-    np.testing.assert_allclose(matrix[0] @ unbounded, rhs[0], rtol=0, atol=1e-9 * np.abs(rhs[0]).max())
+    unbounded = minimum_without_box(matrix[0], rhs[0])
+    np.testing.assert_allclose(matrix[0] @ np.asarray(unbounded), rhs[0], rtol=0, atol=1e-9 * np.abs(rhs[0]).max())

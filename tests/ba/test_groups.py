@@ -7,31 +7,39 @@ import numpy as np
 import pytest
 from dense_reference import start_of
 from jax import Array
+from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 from small_problems import EVERY_CAMERA, small_problem
 
 from jaxba.ba import AttitudePrior, Rows, Step, Unknowns
 from jaxba.ba._problem import AbstractPrior
 from jaxba.ba.groups import PRIORS, Reprojection
+from jaxba.geometry import Pose
 
 PROBLEM = small_problem(EVERY_CAMERA[3], num_cameras=2, lever_arm=True)
 UNKNOWNS = start_of(PROBLEM)
 
 
 def no_step(unknowns: Unknowns) -> Step:
-    poses = jnp.zeros((unknowns.poses.translation.shape[0], 6))
-    return Step(poses, *(jnp.zeros_like(x) for x in (unknowns.intrinsics, unknowns.lever_arm, unknowns.points)))
+    poses = np.zeros((unknowns.poses.translation.shape[0], 6))
+    return Step(poses, *(np.zeros(np.shape(x)) for x in (unknowns.intrinsics, unknowns.lever_arm, unknowns.points)))
 
 
-def assert_rows_equal_jacfwd(prior: AbstractPrior, unknowns: Unknowns, tolerance: float = 1e-12) -> None:
+@quick_jit
+def evaluate(prior: AbstractPrior, unknowns: Unknowns) -> tuple[Array, Step, Step, Rows]:
+    """Return the residual, its derivative, the gradient of the cost, and the prior's own rows."""
+
     def residual(step: Step) -> Array:
         return prior.residual(unknowns.retract(step))
 
-    @jax.jit
-    def every(step: Step) -> tuple[Array, Step, Rows]:
-        return residual(step), jax.jacfwd(residual)(step), prior.rows(unknowns)
+    zero = no_step(unknowns)
+    gradient = jax.grad(lambda step: jnp.sum(residual(step) ** 2))(zero)
+    return residual(zero), jax.jacfwd(residual)(zero), gradient, prior.rows(unknowns)
 
-    value, expected, rows = every(no_step(unknowns))
+
+def assert_rows_equal_jacfwd(prior: AbstractPrior, unknowns: Unknowns, tolerance: float = 1e-12) -> np.ndarray:
+    """Check the prior's rows, and return its residual."""
+    value, expected, gradient, rows = jax.device_get(evaluate(prior, unknowns))
     np.testing.assert_allclose(rows.residual, value, rtol=0, atol=1e-12)
     numbers = np.arange(rows.residual.shape[1])
     for block, whole in (
@@ -41,11 +49,15 @@ def assert_rows_equal_jacfwd(prior: AbstractPrior, unknowns: Unknowns, tolerance
     ):
         dense = np.zeros(whole.shape)
         if block is not None:
-            dense[:, numbers, np.asarray(block.index)] = np.moveaxis(block.jacobian, 1, 2)
+            dense[:, numbers, block.index] = np.moveaxis(block.jacobian, 1, 2)
         # 1e-12 of the largest entry: rounding of two orders of summation
         np.testing.assert_allclose(dense, whole, rtol=0, atol=tolerance * max(1.0, np.abs(whole).max()))
     lever_arm = np.zeros(expected.lever_arm.shape) if rows.lever_arm is None else np.moveaxis(rows.lever_arm, 1, 2)
     np.testing.assert_allclose(lever_arm, expected.lever_arm, rtol=0, atol=1e-12 * max(1.0, np.abs(lever_arm).max()))
+    for reverse, whole in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        forward = 2 * np.einsum("rc,rc...->...", value, whole)
+        np.testing.assert_allclose(reverse, forward, rtol=0, atol=tolerance * max(1.0, np.abs(forward).max()))
+    return value
 
 
 @pytest.mark.parametrize("name", PRIORS)
@@ -57,28 +69,30 @@ def test_derivatives_of_every_prior_equal_jacfwd(name):
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, np.pi - 1e-6, np.pi - 1e-3])
 def test_derivatives_of_an_attitude_equal_jacfwd_from_no_turn_to_half_a_turn(angle):
     axes = np.array([[1.0, 0, 0], [0, 0.6, -0.8], [0.48, 0.6, 0.64]])
-    adjusted = Rotation.from_quat(np.array(UNKNOWNS.poses.quaternion)[:3], scalar_first=True)
+    adjusted = Rotation.from_quat(UNKNOWNS.poses.quaternion[:3], scalar_first=True)
     measured = Rotation.from_rotvec(-angle * axes) * adjusted
-    prior = AttitudePrior(np.arange(3), measured.as_quat(scalar_first=True), np.array([[0.01, 0.02, 0.03]] * 3))
-    assert_rows_equal_jacfwd(prior, UNKNOWNS, tolerance=1e-9)
+    index, std_rad = np.arange(3, dtype=np.int32), np.array([[0.01, 0.02, 0.03]] * 3)
+    prior = AttitudePrior(index, measured.as_quat(scalar_first=True), std_rad)
+    residual = assert_rows_equal_jacfwd(prior, UNKNOWNS, tolerance=1e-9)
     expected = (angle * axes).T / np.array([[0.01], [0.02], [0.03]])
-    np.testing.assert_allclose(prior.residual(UNKNOWNS), expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(residual, expected, rtol=0, atol=1e-7)
 
 
 def test_residuals_of_priors_equal_their_formulas():
-    rotation = Rotation.from_quat(np.array(UNKNOWNS.poses.quaternion), scalar_first=True)
+    rotation = Rotation.from_quat(UNKNOWNS.poses.quaternion, scalar_first=True)
     position, attitude, control = (PROBLEM.prior(name) for name in ("position", "attitude", "control"))
-    centers = rotation.inv().apply(np.array(UNKNOWNS.lever_arm) - np.array(UNKNOWNS.poses.translation))
+    centers = rotation.inv().apply(UNKNOWNS.lever_arm - UNKNOWNS.poses.translation)
     expected = {
         "position": (centers[position.image_index] - position.xyz) / position.std_m,
         "attitude": (
             rotation[attitude.image_index] * Rotation.from_quat(attitude.quaternion, scalar_first=True).inv()
         ).as_rotvec()
         / attitude.std_rad,
-        "control": (np.asarray(UNKNOWNS.points)[control.point_index] - control.xyz) / control.std_m,
+        "control": (UNKNOWNS.points[control.point_index] - control.xyz) / control.std_m,
     }
     for name, values in expected.items():
-        np.testing.assert_allclose(PROBLEM.prior(name).residual(UNKNOWNS).T, values, rtol=0, atol=1e-9)
+        residual = np.asarray(evaluate(PROBLEM.prior(name), UNKNOWNS)[0])
+        np.testing.assert_allclose(residual.T, values, rtol=0, atol=1e-9)
 
 
 def reprojection(camera, refined: tuple[bool, ...]) -> tuple[Reprojection, Unknowns]:
@@ -100,17 +114,15 @@ def reprojection(camera, refined: tuple[bool, ...]) -> tuple[Reprojection, Unkno
     weight = rng.uniform(1, 2, 8)
     weight[7] = 0.0
     group = Reprojection(
-        xy_px=jnp.asarray(rng.uniform(0, 500, (2, 2, 4))),
-        weight=jnp.asarray(weight.reshape(2, 4)),
-        point_index=jnp.arange(8, dtype=jnp.int32).reshape(2, 4),
-        run_image=jnp.asarray(run_image),
-        camera_index=jnp.array([1, 0, 0], jnp.int32),
+        xy_px=rng.uniform(0, 500, (2, 2, 4)),
+        weight=weight.reshape(2, 4),
+        point_index=np.arange(8, dtype=np.int32).reshape(2, 4),
+        run_image=run_image,
+        camera_index=np.array([1, 0, 0], np.int32),
         model=type(camera),
         refined=refined,
     )
-    values = quaternion, translation, parameters, np.zeros(3), points
-    poses, *rest = (jnp.asarray(v) for v in values)
-    return group, Unknowns(type(PROBLEM.poses)(poses, rest[0]), *rest[1:])
+    return group, Unknowns(Pose(quaternion, translation), parameters, np.zeros(3), points)
 
 
 @pytest.mark.parametrize("camera", EVERY_CAMERA, ids=lambda camera: type(camera).__name__)
@@ -121,12 +133,12 @@ def test_derivatives_of_every_camera_equal_jacfwd_with_padding_and_beside_the_ax
     def residual(step: Step) -> Array:
         return group.residual(unknowns.retract(step))[0]
 
-    @jax.jit
+    @quick_jit
     def both(step: Step) -> tuple[Array, Step, Array, Step]:
         pull = jax.vjp(residual, step)[1]
         return residual(step), jax.jacfwd(residual)(step), group.rows(unknowns), pull(jnp.ones((2, 2, 4)))[0]
 
-    value, expected, rows, reverse = both(no_step(unknowns))
+    value, expected, rows, reverse = jax.device_get(both(no_step(unknowns)))
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((value, expected, rows, reverse)))
     assert np.all(np.asarray(value)[:, 1, 3] == 0) and np.all(np.asarray(rows)[1, :, :, 3] == 0)
 
@@ -150,12 +162,8 @@ def test_rows_of_infinite_sigma_weigh_nothing_and_keep_derivatives_finite(name):
     sigma = next(field for field in ("std_m", "std_rad", "std") if hasattr(prior, field))
     padded = eqx.tree_at(lambda p: getattr(p, sigma), prior, np.full_like(getattr(prior, sigma), np.inf))
 
-    @jax.jit
-    def every(unknowns: Unknowns) -> tuple[Array, Step, tuple[Array | None, ...]]:
-        gradient = jax.grad(lambda step: jnp.sum(padded.residual(unknowns.retract(step)) ** 2))(no_step(unknowns))
-        rows = padded.rows(unknowns)
-        touched = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
-        blocks = rows.residual, rows.lever_arm, *touched
-        return padded.residual(unknowns), gradient, blocks
-
-    assert all(np.all(np.asarray(leaf) == 0) for leaf in jax.tree.leaves(every(UNKNOWNS)))
+    residual, _, gradient, rows = jax.device_get(evaluate(padded, UNKNOWNS))
+    touched = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
+    assert touched or rows.lever_arm is not None
+    for leaf in jax.tree.leaves((residual, gradient, rows.residual, rows.lever_arm, touched)):
+        assert np.all(leaf == 0)

@@ -86,7 +86,7 @@ def test_an_error_while_writing_leaves_what_was_there(tmp_path, made, monkeypatc
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "save", full)
-    with pytest.raises(JaxbaError, match=r"made: the disk is full; free space"):
+    with pytest.raises(JaxbaError, match=r"made: not written, No space left on device: free some space"):
         save(tmp_path / "made", made, TWO)
     assert read_record(tmp_path / "made").key == ONE
     assert [path.name for path in tmp_path.iterdir()] == ["made"]

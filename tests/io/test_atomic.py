@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from jaxba._errors import JaxbaError
-from jaxba.io import refuse_same_file, write_atomically
+from jaxba.io import refuse_same_file, remove_leftovers, write_atomically, write_folder_atomically
 
 
 def test_file_appears_at_the_end_and_nothing_else_stays(tmp_path: Path):
@@ -95,6 +95,56 @@ def test_place_where_no_file_can_be_is_refused(tmp_path: Path, name: str, messag
     with pytest.raises(JaxbaError, match=message), write_atomically(tmp_path / name) as file:
         file.write(b"x")
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+
+
+def test_folder_takes_its_place_at_the_end_with_the_folders_above_it(tmp_path: Path):
+    folder = tmp_path / "above" / "made"
+    for content in ("old", "new"):
+        with write_folder_atomically(folder) as partial:
+            (partial / content).touch()
+            assert (os.listdir(folder) if folder.exists() else []) == (["old"] if content == "new" else [])
+        assert os.listdir(folder) == [content] and os.listdir(folder.parent) == ["made"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_interrupted_folder_leaves_the_old_one_and_no_rest(tmp_path: Path, error: type[BaseException]):
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "old").touch()
+    with pytest.raises(error), write_folder_atomically(tmp_path / "made") as partial:
+        (partial / "half").touch()
+        raise error
+    assert os.listdir(tmp_path) == ["made"] and os.listdir(tmp_path / "made") == ["old"]
+
+
+def test_folder_that_cannot_take_its_place_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "old").touch()
+    rename = Path.rename
+
+    def fail(self: Path, target: Path) -> Path:
+        if self.suffix == ".partial":
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fail)
+    with (
+        pytest.raises(JaxbaError, match=r"made: not written, Input/output error: choose another place"),
+        write_folder_atomically(tmp_path / "made"),
+    ):
+        pass
+    assert os.listdir(tmp_path) == ["made"] and os.listdir(tmp_path / "made") == ["old"]
+
+
+def test_what_a_killed_process_leaves_is_removed(tmp_path: Path):
+    code = (
+        "import os, sys\nfrom jaxba.io import write_atomically, write_folder_atomically\nplace = sys.argv[1]\n"
+        "with write_folder_atomically(place + '/made'), write_atomically(place + '/out'):\n    os._exit(1)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
+    assert len(os.listdir(tmp_path)) == 2
+    (tmp_path / "kept.partial").touch()
+    remove_leftovers(tmp_path)
+    assert os.listdir(tmp_path) == ["kept.partial"]
 
 
 def test_link_is_followed(tmp_path: Path):

@@ -163,16 +163,16 @@ def test_an_out_folder_that_cannot_be_made_is_refused(photos: Path, tmp_path: Pa
         Survey(photos, tmp_path / "file").run(until="metadata")
     with pytest.raises(JaxbaError, match="a file is in the way; choose another --out"):
         Survey(photos, tmp_path / "file" / "project").run(until="metadata")
-    with pytest.raises(JaxbaError, match=r"/proc/project: .* choose another --out"):
+    with pytest.raises(JaxbaError, match=r"/proc/project: .*choose another place \(--out\)"):
         Survey(photos, Path("/proc/project")).run(until="metadata")
 
 
 @pytest.mark.parametrize(
     ("code", "message"),
     [
-        (errno.ENOSPC, "the disk is full; free space and run again, what is done is kept"),
-        (errno.EROFS, "the file system is read-only; choose another --out"),
-        (errno.EACCES, "it may not be written to; choose another --out or change its permissions"),
+        (errno.ENOSPC, "No space left on device: free some space, .*; what was written before is kept"),
+        (errno.EROFS, r"Read-only file system: .* choose another place \(--out\)"),
+        (errno.EACCES, r"may not be written to: choose another place \(--out\), or change its permissions"),
     ],
 )
 def test_a_project_that_can_no_longer_be_written_stops_the_run_and_says_why(
@@ -199,7 +199,7 @@ def test_what_may_not_be_read_or_written_is_named(made: Survey, tmp_path: Path):
     with pytest.raises(JaxbaError, match=r"SIM_0001\.JPG: cannot be read .* check its permissions"):
         survey.run(until="metadata")
     survey.project.chmod(0o500)
-    with pytest.raises(JaxbaError, match="may not be written to; choose another --out"):
+    with pytest.raises(JaxbaError, match=r"may not be written to: choose another place \(--out\)"):
         survey.run(until="metadata")
 
 

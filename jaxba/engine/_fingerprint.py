@@ -2,7 +2,8 @@
 
 `fingerprint(value)` goes over a tree of dataclasses, arrays and plain values; paths count as nothing, since a moved
 folder holds the same photos. `code_version(module)` covers the source of a module and of all of jaxba that it imports,
-also inside its functions: a changed solver reruns what is solved with it, and nothing else.
+also inside its functions: a changed solver reruns what is solved with it, and nothing else. What a stage's `lines` and
+`facts` say of its outputs does not count, nor what is imported for them alone: other words rerun nothing.
 """
 
 import ast
@@ -69,17 +70,44 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
 
 @functools.cache
 def code_version(module: str) -> str:
-    """Return a fingerprint of the source of a module of jaxba and of all that it imports of jaxba, directly or not."""
-    sources: dict[str, bytes] = {}
-    waiting = [module]
+    """Return a fingerprint of the source of a stage's module and of all that it imports of jaxba, directly or not.
+
+    The module's functions `lines` and `facts` do not count, nor what is imported for them alone.
+    """
+    path = _source(module)
+    assert path is not None
+    source, waiting = _without_words(path.read_bytes())
+    sources = {module: source}
     while waiting:
         name = waiting.pop()
         path = _source(name)
         if name in sources or path is None:
             continue
         sources[name] = path.read_bytes()
-        waiting.extend(_imports(name, sources[name]))
+        waiting.extend(_imports(ast.parse(sources[name])))
     return fingerprint(sources)
+
+
+_OF_WORDS = ("lines", "facts")
+
+
+def _without_words(source: bytes) -> tuple[bytes, list[str]]:
+    """Return a stage's source without its functions that only say what was made, and the modules that the rest imports.
+
+    Import statements at the top level are cut out, too: they are told by the modules.
+    """
+    tree = ast.parse(source)
+    says = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name in _OF_WORDS]
+    imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+    lines = source.splitlines(keepends=True)
+    for node in (*says, *imports):
+        assert node.end_lineno is not None
+        lines[node.lineno - 1 : node.end_lineno] = [b""] * (node.end_lineno - node.lineno + 1)
+    tree.body = [node for node in tree.body if node not in says]
+    used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    for node in imports:
+        node.names = [alias for alias in node.names if (alias.asname or alias.name).partition(".")[0] in used]
+    return b"".join(lines), sorted(_imports(tree))
 
 
 @functools.cache
@@ -96,9 +124,9 @@ def _source(module: str) -> Path | None:
     return None
 
 
-def _imports(name: str, source: bytes) -> Iterator[str]:
-    """Yield the modules of jaxba that a module imports; a name from a package is followed to where it is defined."""
-    for node in ast.walk(ast.parse(source)):
+def _imports(tree: ast.Module) -> Iterator[str]:
+    """Yield the modules that a module imports; a name from a package of jaxba is followed to where it is defined."""
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("jaxba"):

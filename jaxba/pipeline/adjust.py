@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._words import many
-from jaxba.report import Told, control_facts, grouped
-from jaxba.scene import Block, Control, ControlFit, Features, Left, Photo, Reference, Tracks, ViewGraph
+from jaxba.report import Told, control_facts, grouped, sentences
+from jaxba.scene import Block, Control, ControlFit, Features, Finding, Left, Photo, Reference, Tracks, ViewGraph
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,7 @@ class Outputs:
     - `gnss_offset_m`: added to measured positions, an axis, where control fixes the block; else 0.
     - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
     - `affine`: 3 x 4, what coordinates take beside the block, of `control.method=affine`; else the identity.
-    - `findings`: what a surveyor should know, in sentences: ambiguities, contradictions, bounds reached.
+    - `findings`: what a surveyor should know, in figures: ambiguities, contradictions, bounds reached.
     """
 
     block: Block
@@ -90,7 +90,7 @@ class Outputs:
     rounds: int
     std_px: float
     position_scale: Float[np.ndarray, "3"]
-    findings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     pruned: tuple[Left, ...] = ()
     solver: str = ""
     gnss_offset_m: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
@@ -191,7 +191,7 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
         "cameras": {
             name: {"parameters": list(map(float, row)), "std": list(map(float, std))} for name, row, std in cameras
         },
-        "findings": list(outputs.findings),
+        "findings": sentences(outputs.findings),
     }
     if not told.control.num_points:
         return {"adjust": adjusted}

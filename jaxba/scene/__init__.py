@@ -5,6 +5,7 @@ from jaxba.scene._block import Block
 from jaxba.scene._candidates import joining_pairs, nearest_pairs, pairs_between, window_pairs
 from jaxba.scene._control import Control, ControlFit
 from jaxba.scene._features import Features
+from jaxba.scene._finding import Finding
 from jaxba.scene._footprint import Footprints, footprint_overlaps, footprint_pairs, ground_footprints
 from jaxba.scene._graph import components
 from jaxba.scene._pair_record import Fallback, Missed, Model, PairRecord
@@ -15,7 +16,7 @@ from jaxba.scene._tracks import Tracks
 from jaxba.scene._view_graph import EdgeStatus, ViewGraph
 
 __all__ = [
-    "Attitude", "Block", "Control", "ControlFit", "EdgeStatus", "Fallback", "Features", "Footprints", "Left",
+    "Attitude", "Block", "Control", "ControlFit", "EdgeStatus", "Fallback", "Features", "Finding", "Footprints", "Left",
     "LocalFrame", "Missed", "Model", "PairRecord", "Photo", "PhotoFile", "Position", "Reference", "Tracks",
     "ViewGraph", "build_tracks", "cam_from_enu", "components", "footprint_overlaps", "footprint_pairs",
     "ground_footprints", "joining_pairs", "nearest_pairs", "pairs_between", "window_pairs",

@@ -1,4 +1,4 @@
-"""Findings: what a surveyor should know of an adjusted block, each a sentence or two with figures and the cure."""
+"""Findings: what a surveyor should know of an adjusted block, each a kind and its figures; `jaxba.report` has words."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 from jaxba.geometry import CAMERAS
-from jaxba.scene import Block, Photo, Reference
+from jaxba.scene import Block, Finding, Photo, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._bounds import intrinsics_at_bounds
 from jaxba.sfm._problem import natural_intrinsics, used_positions
@@ -80,7 +80,7 @@ def findings(
     photos: Sequence[Photo],
     *,
     is_controlled: bool = False,
-) -> tuple[str, ...]:
+) -> tuple[Finding, ...]:
     """Return the findings on an adjusted block.
 
     - `start`: the block before the adjustment. `is_controlled`: control points fix it in all axes.
@@ -98,7 +98,7 @@ def findings(
             *_focal_and_height(block, sigmas, reference, is_controlled),
             *_intrinsics(block, start, photos),
             *_positions(block, sigmas, reference, photos, is_controlled),
-            *([sigmas.why_not] if sigmas.why_not else []),
+            *([Finding.of("note", text=sigmas.why_not)] if sigmas.why_not else []),
         ]
     )
 
@@ -113,55 +113,50 @@ def height_above_ground(block: Block) -> Float[np.ndarray, " images"]:
     return block.centers_m[:, 2] - np.array(ground)
 
 
-def _convergence(adjusted: Adjusted) -> list[str]:
-    found, last_px = list(adjusted.notes), adjusted.medians_px[-1]
-    medians = ", ".join(f"{m:.2f}" for m in adjusted.medians_px)
-    if not adjusted.converged and len(adjusted.medians_px) > 2:
-        found.append(
-            f"The median error still changed after {len(adjusted.medians_px)} rounds ({medians} px); set "
-            "adjust.max_rounds higher, or look at the edges and images named here."
-        )
+def _convergence(adjusted: Adjusted) -> list[Finding]:
+    found = [Finding.of("note", text=note) for note in adjusted.notes]
+    medians_px = [float(median) for median in adjusted.medians_px]
+    if not adjusted.converged and len(medians_px) > 2:
+        found.append(Finding.of("not settled", medians_px=medians_px))
     if not adjusted.solution.converged:
-        found.append(f"The last solve: {adjusted.solution.advice}")
-    if last_px > 3.0:
-        found.append(
-            f"The median error is {last_px:.1f} px: check the focal length against the sensor's "
-            "specification, and whether cameras or zooms are mixed."
-        )
+        found.append(Finding.of("not converged", advice=adjusted.solution.advice))
+    if medians_px[-1] > 3.0:
+        found.append(Finding.of("large median", median_px=medians_px[-1]))
     return found
 
 
-def _edges(adjusted: Adjusted) -> list[str]:
-    return [f"Edge left out: {left.name}: {left.reason}." for left in adjusted.pruned]
+def _edges(adjusted: Adjusted) -> list[Finding]:
+    return [Finding.of("edge left out", name=left.name, reason=left.reason) for left in adjusted.pruned]
 
 
-def _images(adjusted: Adjusted, photos: Sequence[Photo]) -> list[str]:
+def _images(adjusted: Adjusted, photos: Sequence[Photo]) -> list[Finding]:
     block = adjusted.block
-    found = [f"Image lost in the adjustment: {left.name}: {left.reason}." for left in adjusted.lost]
+    found = [Finding.of("image lost", name=left.name, reason=left.reason) for left in adjusted.lost]
     counts = np.bincount(block.observation_image, minlength=block.num_images)
     weak = np.flatnonzero(counts < _WEAK_OBSERVATIONS)
     if len(weak):
-        found.append(
-            f"{_many(len(weak), 'image')} with fewer than {_WEAK_OBSERVATIONS} points, so weakly placed: "
-            f"{_names(block, photos, weak, [f'{counts[i]} points' for i in weak])}. More overlap or features cure it."
-        )
+        names = _names(block, photos, weak)
+        found.append(Finding.of("few points", names=names, points=counts[weak].tolist(), least=_WEAK_OBSERVATIONS))
     return found
 
 
-def _outliers(block: Block, fit: GnssFit, photos: Sequence[Photo]) -> list[str]:
+def _outliers(block: Block, fit: GnssFit, photos: Sequence[Photo]) -> list[Finding]:
     bad = np.flatnonzero(fit.is_outlier)
     if not len(bad):
         return []
     bad = bad[np.argsort(-np.nan_to_num(np.abs(fit.residual_m[bad])).max(axis=1), kind="stable")]
-    figures = [", ".join(f"{r:+.1f}" if np.isfinite(r) else "none" for r in fit.residual_m[i]) + " m" for i in bad]
     return [
-        f"{_many(len(bad), 'measured position')} of {fit.num + len(bad)} contradict the photos by more than "
-        f"{_OUTLIER:g} robust sigmas and hardly count (adjusted minus measured, east, north, up): "
-        f"{_names(block, photos, bad, figures)}."
+        Finding.of(
+            "positions contradict",
+            names=_names(block, photos, bad),
+            residual_m=fit.residual_m[bad].tolist(),
+            measured=fit.num + len(bad),
+            sigmas=_OUTLIER,
+        )
     ]
 
 
-def _scatter(adjusted: Adjusted, reference: Reference, fit: GnssFit) -> list[str]:
+def _scatter(adjusted: Adjusted, reference: Reference, fit: GnssFit) -> list[Finding]:
     """Axes in which residuals are over 1.5 times their sigmas, and more than chance makes them (chi-square, 0.1%)."""
     index = adjusted.block.image_index
     if not used_positions(adjusted.block, reference).any():
@@ -174,18 +169,17 @@ def _scatter(adjusted: Adjusted, reference: Reference, fit: GnssFit) -> list[str
     excess &= np.nansum(ratio**2, axis=0) > by_chance
     if not excess.any():
         return []
-    text = ", ".join(
-        f"{axis} {s:.2g} m instead of {t:.2g} m"
-        for axis, s, t, k in zip(("east", "north", "up"), fit.scale_m, stated, excess, strict=True)
-        if k
-    )
     return [
-        f"Measured positions scatter more than their sigmas say ({text}); the sigmas were enlarged to that. Check the "
-        "antenna's offset, the time between exposure and fix, and whether the receiver had its fixed solution."
+        Finding.of(
+            "positions scatter",
+            axes=[axis for axis, much in zip(("east", "north", "up"), excess, strict=True) if much],
+            scale_m=fit.scale_m[excess].tolist(),
+            stated_m=stated[excess].tolist(),
+        )
     ]
 
 
-def _height_drift(block: Block, reference: Reference) -> list[str]:
+def _height_drift(block: Block, reference: Reference) -> list[Finding]:
     """Heights that wander in the order of the photos: a receiver that drifts, not noise."""
     every = block.image_index
     measured = np.isfinite(reference.xyz_m[every, 2]) & np.isfinite(reference.std_m[every, 2])
@@ -199,25 +193,17 @@ def _height_drift(block: Block, reference: Reference) -> list[str]:
     limit = max(3 * float(np.median(reference.std_m[every[rows], 2])), 0.1)
     if share < _DRIFT or 2 * abs(slope) < limit:
         return []
-    return [
-        f"Measured heights drift against the photos by {2 * abs(slope):.1f} m from the first to the last photo, which "
-        f"explains {share:.0%} of their residuals: the receiver's altitude cannot be trusted. Leave heights out, or "
-        "use ground control."
-    ]
+    return [Finding.of("heights drift", drift_m=float(2 * abs(slope)), share=float(share))]
 
 
-def _no_heights(block: Block, reference: Reference) -> list[str]:
+def _no_heights(block: Block, reference: Reference) -> list[Finding]:
     index = block.image_index[used_positions(block, reference)]
     if not len(index) or np.isfinite(reference.std_m[index, 2]).any():
         return []
-    return [
-        "No measured height is used, so the block's height and its tilt are those of the start values and not "
-        "measured: heights and slopes of the results are not to be relied on. Add ground control, or photos with "
-        "heights that can be trusted."
-    ]
+    return [Finding.of("no heights")]
 
 
-def _focal_and_height(block: Block, sigmas: Uncertainty, reference: Reference, is_controlled: bool) -> list[str]:
+def _focal_and_height(block: Block, sigmas: Uncertainty, reference: Reference, is_controlled: bool) -> list[Finding]:
     """The focal length and the height above ground of a flat nadir block trade off: df / f = dh / h.
 
     The flight's own record is compared where no control points have fixed heights.
@@ -233,50 +219,37 @@ def _focal_and_height(block: Block, sigmas: Uncertainty, reference: Reference, i
     focal, sigma = block.camera_parameters[0, 0], sigmas.intrinsics_std[0, 0]
     share = sigma / focal
     both = np.isfinite(adjusted_m) & np.isfinite(measured_m)
-    found = []
-    contradicts = False
-    tie = ""
+    flight: dict[str, float] = {}
     if both.any():
         adjusted_median, measured_median = float(np.median(adjusted_m[both])), float(np.median(measured_m[both]))
-        ratio = adjusted_median / measured_median
-        contradicts = abs(ratio - 1) > _HEIGHT_OFF and not is_controlled
-        tie = (
-            f"The cameras are {adjusted_median:.1f} m above the ground points by the adjustment and "
-            f"{measured_median:.1f} m above the take-off point by the flight's own record ({ratio - 1:+.0%})"
+        if abs(adjusted_median / measured_median - 1) > _HEIGHT_OFF and not is_controlled:
+            flight = {"above_ground_m": adjusted_median, "above_take_off_m": measured_median}
+    if not flight and not (np.isfinite(share) and share > _HEIGHT_SIGMA):
+        return []
+    return [
+        Finding.of(
+            "focal and height",
+            parameter=names[0],
+            focal_px=float(focal),
+            std_px=float(sigma),
+            height_m=height,
+            looks=_looks(block, adjusted_m),
+            **flight,
         )
-    weak = np.isfinite(share) and share > _HEIGHT_SIGMA
-    if contradicts or weak:
-        cause = _geometry(block, adjusted_m)
-        text = (
-            f"Focal length and height trade off{cause}: {names[0]} is {focal:.1f} px with a sigma of "
-            f"{sigma:.1f} px ({share:.1%}), which alone makes the height above ground of {height:.1f} m uncertain by "
-            f"{share * height:.1f} m."
-        )
-        if contradicts:
-            text += (
-                f" {tie}; a focal length of {focal / ratio:.0f} px would agree with it, if the ground lies at the "
-                "height of the take-off point."
-            )
-        text += (
-            " Hold the focal length at a calibrated value (metadata.focal), fly a second height, add oblique photos, "
-            "or measure ground control."
-        )
-        found.append(text)
-    return found
+    ]
 
 
-def _geometry(block: Block, height_m: Float[np.ndarray, " images"]) -> str:
+def _looks(block: Block, height_m: Float[np.ndarray, " images"]) -> str:
+    """Return how the cameras look: `down from one height`, `down`, or `around`."""
     x, y = block.quaternion[:, 1], block.quaternion[:, 2]
     down = np.abs(1 - 2 * (x**2 + y**2))  # the viewing direction's vertical part
     if np.mean(down) < _NADIR:
-        return ""
+        return "around"
     spread = np.ptp(np.percentile(block.centers_m[:, 2], [5, 95])) / max(float(np.nanmedian(height_m)), 1e-9)
-    return (
-        " (all photos look straight down from one height)" if spread < _ONE_HEIGHT else " (photos look straight down)"
-    )
+    return "down from one height" if spread < _ONE_HEIGHT else "down"
 
 
-def _intrinsics(block: Block, start: Block, photos: Sequence[Photo]) -> list[str]:
+def _intrinsics(block: Block, start: Block, photos: Sequence[Photo]) -> list[Finding]:
     natural = natural_intrinsics(start, photos)
     names = CAMERAS[block.camera_model].parameter_names()
     at_bound = {(bound.camera, bound.parameter): bound for bound in intrinsics_at_bounds(block, start, photos)}
@@ -285,31 +258,21 @@ def _intrinsics(block: Block, start: Block, photos: Sequence[Photo]) -> list[str
         values = block.camera_parameters[c]
         width = 2 * natural.center[c, names.index("cx")]
         for k, name in enumerate(names):
-            value = values[k]
+            value, natural_px = float(values[k]), float(natural.center[c, k])
+            of = {"camera": label, "parameter": name, "value": value}
             if (label, name) in at_bound:
                 bound = at_bound[label, name]
-                found.append(
-                    f"Camera {label}: {name} is at its bound ({value:.4g}, allowed {bound.low:.4g} to "
-                    f"{bound.high:.4g}): the "
-                    "calibration takes up another error. Check the focal length and the camera model, add oblique "
-                    "photos or control, or hold it fixed."
-                )
-            elif name in ("f", "fx") and abs(value / natural.center[c, k] - 1) > _FOCAL_OFF:
-                found.append(
-                    f"Camera {label}: {name} moved from {natural.center[c, k]:.0f} to {value:.0f} px "
-                    f"({value / natural.center[c, k] - 1:+.1%}). Compare with the sensor's specification."
-                )
-            elif name in ("cx", "cy") and abs(value - natural.center[c, k]) > _CENTER_OFF * width:
-                found.append(
-                    f"Camera {label}: the principal point's {name} is {value - natural.center[c, k]:+.0f} px off the "
-                    "middle; in a block without cross strips it may stand for a tilt. Photos turned by 90 degrees tell."
-                )
+                found.append(Finding.of("at bound", **of, low=float(bound.low), high=float(bound.high)))
+            elif name in ("f", "fx") and abs(value / natural_px - 1) > _FOCAL_OFF:
+                found.append(Finding.of("focal moved", **of, before=natural_px))
+            elif name in ("cx", "cy") and abs(value - natural_px) > _CENTER_OFF * width:
+                found.append(Finding.of("principal point off", **of, middle=natural_px))
     return found
 
 
 def _positions(
     block: Block, sigmas: Uncertainty, reference: Reference, photos: Sequence[Photo], is_controlled: bool
-) -> list[str]:
+) -> list[Finding]:
     std = sigmas.position_std_m
     known = np.isfinite(std).all(axis=0)  # not the axes in which no position is measured
     if not known.any():
@@ -319,26 +282,15 @@ def _positions(
     middle = float(np.median(largest))
     weak = np.flatnonzero(largest > max(5 * middle, 0.02))
     if len(weak):
-        found.append(
-            f"{_many(len(weak), 'image')} with a position sigma over five times the median of {middle:.2g} m: "
-            f"{_names(block, photos, weak, [f'{largest[i]:.2g} m' for i in weak])}."
-        )
+        names, std_m = _names(block, photos, weak), largest[weak].tolist()
+        found.append(Finding.of("weak positions", names=names, std_m=std_m, median_m=middle))
     used = used_positions(block, reference)
     if used.any() and not is_controlled:
         stated = np.median(reference.std_m[block.image_index[used]], axis=0)
         if np.isfinite(stated[0]) and stated[0] > 1:
-            found.append(
-                f"Position sigmas (median {middle:.2g} m) are about the mean of all GNSS positions. Those of a single "
-                f"receiver have an offset in common, up to their own sigma of {stated[0]:.1f} m horizontally, which "
-                "is not in these: only control or a differential receiver removes it."
-            )
+            found.append(Finding.of("common offset", median_m=middle, receiver_std_m=float(stated[0])))
     return found
 
 
-def _names(block: Block, photos: Sequence[Photo], rows: Int[np.ndarray, " rows"], figures: Sequence[str]) -> str:
-    shown = [f"{photos[int(block.image_index[i])].name} ({figure})" for i, figure in zip(rows, figures, strict=True)]
-    return ", ".join(shown[:10]) + (f" and {len(shown) - 10} more" if len(shown) > 10 else "")
-
-
-def _many(count: int, kind: str) -> str:
-    return f"{count} {kind}{'' if count == 1 else 's'}"
+def _names(block: Block, photos: Sequence[Photo], rows: Int[np.ndarray, " rows"]) -> list[str]:
+    return [photos[int(block.image_index[i])].name for i in rows]

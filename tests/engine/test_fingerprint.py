@@ -1,9 +1,11 @@
+import ast
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jaxba.engine import _fingerprint
 from jaxba.engine._fingerprint import _imports, code_version, fingerprint
 
 
@@ -52,7 +54,7 @@ def test_an_unknown_kind_is_refused():
 
 def test_code_version_follows_imports_to_where_a_name_is_defined():
     source = b"def f():\n    from jaxba.io import write_tile\n    from jaxba.scene import Left\nimport numpy"
-    assert set(_imports("x", source)) == {"jaxba.io._tile", "jaxba.scene._photo", "numpy"}
+    assert set(_imports(ast.parse(source))) == {"jaxba.io._tile", "jaxba.scene._photo", "numpy"}
 
 
 def test_code_version_differs_by_stage_and_repeats():
@@ -62,8 +64,6 @@ def test_code_version_differs_by_stage_and_repeats():
 
 
 def test_code_version_changes_with_what_is_imported(monkeypatch, tmp_path):
-    from jaxba.engine import _fingerprint
-
     changed = tmp_path / "_rotation.py"
     original = _fingerprint._source("jaxba.geometry._rotation")
     assert original is not None
@@ -77,3 +77,50 @@ def test_code_version_changes_with_what_is_imported(monkeypatch, tmp_path):
     code_version.cache_clear()
     assert after["jaxba.pipeline.features"] == before["jaxba.pipeline.features"]
     assert after["jaxba.ba._solve"] != before["jaxba.ba._solve"]
+
+
+@pytest.fixture
+def with_change(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Return the version of a stage's code with a text of a module replaced by another."""
+    real = _fingerprint._source.__wrapped__
+
+    def version(stage: str, module: str, before: str, after: str) -> str:
+        original = real(module)
+        assert original is not None and before in original.read_text()
+        changed = tmp_path / "changed.py"
+        changed.write_text(original.read_text().replace(before, after))
+        monkeypatch.setattr(_fingerprint, "_source", lambda name: changed if name == module else real(name))
+        code_version.cache_clear()
+        found = code_version(stage)
+        monkeypatch.undo()
+        code_version.cache_clear()
+        return found
+
+    return version
+
+
+@pytest.mark.parametrize(
+    ("module", "before", "after"),
+    [
+        ("jaxba.pipeline.adjust", "median {outputs.median_px:.2f} px", "a median of {outputs.median_px:.2f} px"),
+        ("jaxba.pipeline.adjust", "import Told,", "import Picture, Told,"),
+        ("jaxba.report._reasons", "more such files", "more of these"),
+        ("jaxba.report._findings", "look at the edges", "see the edges"),
+    ],
+)
+def test_other_words_rerun_nothing(with_change, module: str, before: str, after: str):
+    stage = "jaxba.pipeline.adjust"
+    assert with_change(stage, module, before, after) == code_version(stage)
+
+
+@pytest.mark.parametrize(
+    ("stage", "module", "before", "after"),
+    [
+        ("adjust", "jaxba.pipeline.adjust", "sigmas = controlled.sigmas", "sigmas = sigmas"),
+        ("adjust", "jaxba.sfm._findings", "_OUTLIER = 3.0", "_OUTLIER = 4.0"),
+        ("export", "jaxba.report._picture", "MOST_POINTS = 200_000", "MOST_POINTS = 100_000"),  # is a file of its own
+    ],
+)
+def test_what_is_made_otherwise_is_made_anew(with_change, stage: str, module: str, before: str, after: str):
+    stage = f"jaxba.pipeline.{stage}"
+    assert with_change(stage, module, before, after) != code_version(stage)

@@ -30,7 +30,8 @@ def quick(made: Survey, monkeypatch: pytest.MonkeyPatch) -> None:
         return start.Outputs(block=dataclasses.replace(block, notes=(fingerprint(inputs, params),)))
 
     def adjust_run(inputs: adjust.Inputs, params: adjust.Params) -> adjust.Outputs:
-        return dataclasses.replace(done.adjust, findings=(fingerprint(inputs, params),))
+        mark = Finding.of("note", text=fingerprint(inputs, params))
+        return dataclasses.replace(done.adjust, findings=(mark,))
 
     monkeypatch.setattr(start, "run", start_run)
     monkeypatch.setattr(adjust, "run", adjust_run)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from simulated import Simulated, simulate, true_block
 
 from jaxba.ba import make_plan
+from jaxba.report import sentences
 from jaxba.scene import Control
 from jaxba.sfm import (
     Adjusted,
@@ -81,7 +82,7 @@ def run(survey: Simulated, control: Control) -> tuple[Adjusted, Controlled]:
 
 
 def told(survey: Simulated, control: Control, made: tuple[Adjusted, Controlled]) -> str:
-    return " ".join(control_findings(made[0], control, made[1].fit, survey.reference, survey.photos))
+    return " ".join(sentences(control_findings(made[0], control, made[1].fit, survey.reference, survey.photos)))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from simulated import Simulated, simulate, true_block
 
+from jaxba.report import sentences
 from jaxba.scene import Block, Left, Reference
 from jaxba.sfm import Adjusted, Settings, Uncertainty, adjust, findings, gnss_fit, height_above_ground, with_points
 
@@ -40,7 +41,7 @@ def _findings(
     std[:, :2] = focal_std_px
     sigmas = Uncertainty(np.full((block.num_images, 3), 0.02), np.full((block.num_points, 3), 0.05), std, 1.0)
     fit = gnss_fit(block, reference)
-    return "\n".join(findings(adjusted, survey.block, sigmas, fit, reference, survey.photos))
+    return "\n".join(sentences(findings(adjusted, survey.block, sigmas, fit, reference, survey.photos)))
 
 
 def _with_block(adjusted: Adjusted, **changes: object) -> Adjusted:
@@ -152,5 +153,5 @@ def test_position_sigmas_are_those_of_the_axes_that_were_measured(adjusted: Adju
         1.0,
     )
     fit = gnss_fit(adjusted.block, without_heights)
-    text = "\n".join(findings(adjusted, survey.block, sigmas, fit, without_heights, survey.photos))
+    text = "\n".join(sentences(findings(adjusted, survey.block, sigmas, fit, without_heights, survey.photos)))
     assert "Position sigmas (median 0.03 m)" in text and "nan" not in text

@@ -1,0 +1,111 @@
+"""Findings on control and check points in words."""
+
+import math
+from collections.abc import Callable, Sequence
+
+_PARTS = {
+    "adjust": " It pulls the block no harder than a point that is off by 3 sigmas; make it a check point "
+    "(control.check) to leave it out.",
+    "helmert": " It was left out of the fit where others remained.",
+    "affine": " It was left out of the fit where others remained.",
+}
+
+
+def _without_a_place() -> str:
+    return "The block has no place on earth, so that its control and check points cannot be compared with it."
+
+
+def _not_marked_twice(names: Sequence[str], marks: Sequence[int]) -> str:
+    rows = zip(names, marks, strict=True)
+    lost = ", ".join(f"{name} ({count} mark{'' if count == 1 else 's'})" for name, count in rows)
+    return f"Points that are not marked in two adjusted photos or more, and not used: {lost}. Mark them in more photos."
+
+
+def _few(count: int, least: int, is_fit: bool) -> str:
+    what = "so no fit was made" if is_fit else "so they do not fix the block by themselves"
+    return f"{count} control points can be used where {least} are needed, {what}. Mark more of them."
+
+
+def _on_a_line(count: int) -> str:
+    return (
+        f"The {count} control points lie on a line, so that they do not hold the block from turning about it. "
+        "Survey some to its sides."
+    )
+
+
+def _horizontal_only() -> str:
+    return (
+        "Control is horizontal only and no position has a height, so the block's height and tilt are those of "
+        "the start values (cameras look down on average): heights and slopes are not to be relied on. Survey "
+        "the heights of three control points or more."
+    )
+
+
+def _marks_contradict(marks: Sequence[Sequence[str]], std_px: float) -> str:
+    names = ", ".join(f"{point} in {photo}" for point, photo in marks)
+    return (
+        f"Marks that contradict the others of their point by over 5 sigmas (control.mark_std_px="
+        f"{std_px:g}), left out: {names}. Look at them."
+    )
+
+
+def _marks_off(median_px: float, std_px: float) -> str:
+    return (
+        f"Marks miss their points by {median_px:.1f} px in the median (sigma {std_px:g} px): were "
+        "they set in photos of another size (control.mark_width_px), or counted from another corner?"
+    )
+
+
+def _marks_disagree(marks: int, name: str, rms_px: float) -> str:
+    return (
+        f"The {marks} marks of {name} do not agree (RMS "
+        f"{rms_px:.1f} px), and which is wrong cannot be told: look at them, or mark more "
+        "photos."
+    )
+
+
+def _scatters(count: int, axes: Sequence[str], scatter_m: Sequence[float], stated_m: Sequence[float]) -> str:
+    rows = zip(axes, scatter_m, stated_m, strict=True)
+    parts = ", ".join(f"{scatter:.2g} m {axis} where their sigma is {stated:.2g} m" for axis, scatter, stated in rows)
+    return (
+        f"The {count} control points contradict the block, most of them and not one: they scatter by "
+        f"{parts}. Their sigmas were enlarged to that. Compare how they were surveyed with control.std_h "
+        "and control.std_v, and check their CRS, names and marks."
+    )
+
+
+def _contradicts(
+    name: str, is_check: bool, residual_m: Sequence[float], over_sigma: float, limit: float, method: str
+) -> str:
+    residual = ", ".join(f"{value:+.3f}" if math.isfinite(value) else "none" for value in residual_m)
+    part = "" if is_check else _PARTS.get(method, "")
+    return (
+        f"{'Check' if is_check else 'Control'} point {name} contradicts the block: adjusted minus surveyed {residual} "
+        f"m east, north, up, {over_sigma:.1f} sigmas where {limit:g} are exceeded by chance in one of a thousand. Check "
+        f"its coordinates, its name and its marks.{part}"
+    )
+
+
+def _gnss_off(offset_m: Sequence[float], std_m: Sequence[float], is_compared: bool) -> str:
+    figures = ", ".join(f"{value:+.2f}" if math.isfinite(value) else "unknown" for value in offset_m)
+    how = "compared only" if is_compared else "the block follows control"
+    return (
+        f"GNSS positions minus the block as control places it: {figures} m east, north, up, for all photos in common, "
+        f"with sigmas of {', '.join(f'{s:.2g}' for s in std_m)} m; {how}. Decimetres are the antenna's offset; metres "
+        "and tens of metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the two."
+    )
+
+
+CONTROL_WORDS: dict[str, Callable[..., str]] = {
+    "control without a place": _without_a_place,
+    "control not marked twice": _not_marked_twice,
+    "few control points": _few,
+    "control on a line": _on_a_line,
+    "control horizontal only": _horizontal_only,
+    "marks contradict": _marks_contradict,
+    "marks off": _marks_off,
+    "marks disagree": _marks_disagree,
+    "control scatters": _scatters,
+    "control point contradicts": _contradicts,
+    "gnss off control": _gnss_off,
+}

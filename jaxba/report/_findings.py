@@ -1,0 +1,201 @@
+"""Findings in words: what a surveyor should know of an adjusted block, in a sentence or two with figures and cure.
+
+Which findings hold is decided in `jaxba.sfm` by figures alone; other words here rerun no solve.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+from jaxba.engine._words import many
+from jaxba.report._control_findings import CONTROL_WORDS
+from jaxba.scene import Finding
+
+_MOST_NAMES = 10
+_LOOKS = {
+    "down from one height": " (all photos look straight down from one height)",
+    "down": " (photos look straight down)",
+    "around": "",
+}
+
+
+def sentence(finding: Finding) -> str:
+    """Return a finding in words.
+
+    >>> sentence(Finding.of("edge left out", name="a.jpg, b.jpg", reason="12 matches are off by 5.1 px"))
+    'Edge left out: a.jpg, b.jpg: 12 matches are off by 5.1 px.'
+    """
+    return WORDS[finding.kind](**finding.figures)
+
+
+def sentences(findings: Sequence[Finding]) -> list[str]:
+    """Return findings in words, in their order."""
+    return [sentence(finding) for finding in findings]
+
+
+def _note(text: str) -> str:
+    return text
+
+
+def _not_settled(medians_px: Sequence[float]) -> str:
+    medians = ", ".join(f"{m:.2f}" for m in medians_px)
+    return (
+        f"The median error still changed after {len(medians_px)} rounds ({medians} px); set "
+        "adjust.max_rounds higher, or look at the edges and images named here."
+    )
+
+
+def _not_converged(advice: str) -> str:
+    return f"The last solve: {advice}"
+
+
+def _large_median(median_px: float) -> str:
+    return (
+        f"The median error is {median_px:.1f} px: check the focal length against the sensor's "
+        "specification, and whether cameras or zooms are mixed."
+    )
+
+
+def _edge_left_out(name: str, reason: str) -> str:
+    return f"Edge left out: {name}: {reason}."
+
+
+def _image_lost(name: str, reason: str) -> str:
+    return f"Image lost in the adjustment: {name}: {reason}."
+
+
+def _few_points(names: Sequence[str], points: Sequence[int], least: int) -> str:
+    return (
+        f"{many(len(names), 'image')} with fewer than {least} points, so weakly placed: "
+        f"{_named(names, [f'{count} points' for count in points])}. More overlap or features cure it."
+    )
+
+
+def _positions_contradict(
+    names: Sequence[str], residual_m: Sequence[Sequence[float]], measured: int, sigmas: float
+) -> str:
+    figures = [", ".join(f"{r:+.1f}" if math.isfinite(r) else "none" for r in row) + " m" for row in residual_m]
+    return (
+        f"{many(len(names), 'measured position')} of {measured} contradict the photos by more than "
+        f"{sigmas:g} robust sigmas and hardly count (adjusted minus measured, east, north, up): "
+        f"{_named(names, figures)}."
+    )
+
+
+def _positions_scatter(axes: Sequence[str], scale_m: Sequence[float], stated_m: Sequence[float]) -> str:
+    rows = zip(axes, scale_m, stated_m, strict=True)
+    text = ", ".join(f"{axis} {scale:.2g} m instead of {stated:.2g} m" for axis, scale, stated in rows)
+    return (
+        f"Measured positions scatter more than their sigmas say ({text}); the sigmas were enlarged to that. Check the "
+        "antenna's offset, the time between exposure and fix, and whether the receiver had its fixed solution."
+    )
+
+
+def _heights_drift(drift_m: float, share: float) -> str:
+    return (
+        f"Measured heights drift against the photos by {drift_m:.1f} m from the first to the last photo, which "
+        f"explains {share:.0%} of their residuals: the receiver's altitude cannot be trusted. Leave heights out, or "
+        "use ground control."
+    )
+
+
+def _no_heights() -> str:
+    return (
+        "No measured height is used, so the block's height and its tilt are those of the start values and not "
+        "measured: heights and slopes of the results are not to be relied on. Add ground control, or photos with "
+        "heights that can be trusted."
+    )
+
+
+def _focal_and_height(
+    parameter: str,
+    focal_px: float,
+    std_px: float,
+    height_m: float,
+    looks: str,
+    above_ground_m: float | None = None,
+    above_take_off_m: float | None = None,
+) -> str:
+    share = std_px / focal_px
+    text = (
+        f"Focal length and height trade off{_LOOKS[looks]}: {parameter} is {focal_px:.1f} px with a sigma of "
+        f"{std_px:.1f} px ({share:.1%}), which alone makes the height above ground of {height_m:.1f} m uncertain by "
+        f"{share * height_m:.1f} m."
+    )
+    if above_ground_m is not None and above_take_off_m is not None:
+        ratio = above_ground_m / above_take_off_m
+        text += (
+            f" The cameras are {above_ground_m:.1f} m above the ground points by the adjustment and "
+            f"{above_take_off_m:.1f} m above the take-off point by the flight's own record ({ratio - 1:+.0%}); a focal "
+            f"length of {focal_px / ratio:.0f} px would agree with it, if the ground lies at the height of the "
+            "take-off point."
+        )
+    return text + (
+        " Hold the focal length at a calibrated value (metadata.focal), fly a second height, add oblique photos, "
+        "or measure ground control."
+    )
+
+
+def _at_bound(camera: str, parameter: str, value: float, low: float, high: float) -> str:
+    return (
+        f"Camera {camera}: {parameter} is at its bound ({value:.4g}, allowed {low:.4g} to {high:.4g}): the "
+        "calibration takes up another error. Check the focal length and the camera model, add oblique "
+        "photos or control, or hold it fixed."
+    )
+
+
+def _focal_moved(camera: str, parameter: str, value: float, before: float) -> str:
+    return (
+        f"Camera {camera}: {parameter} moved from {before:.0f} to {value:.0f} px "
+        f"({value / before - 1:+.1%}). Compare with the sensor's specification."
+    )
+
+
+def _principal_point_off(camera: str, parameter: str, value: float, middle: float) -> str:
+    return (
+        f"Camera {camera}: the principal point's {parameter} is {value - middle:+.0f} px off the "
+        "middle; in a block without cross strips it may stand for a tilt. Photos turned by 90 degrees tell."
+    )
+
+
+def _weak_positions(names: Sequence[str], std_m: Sequence[float], median_m: float) -> str:
+    return (
+        f"{many(len(names), 'image')} with a position sigma over five times the median of {median_m:.2g} m: "
+        f"{_named(names, [f'{std:.2g} m' for std in std_m])}."
+    )
+
+
+def _common_offset(median_m: float, receiver_std_m: float) -> str:
+    return (
+        f"Position sigmas (median {median_m:.2g} m) are about the mean of all GNSS positions. Those of a single "
+        f"receiver have an offset in common, up to their own sigma of {receiver_std_m:.1f} m horizontally, which "
+        "is not in these: only control or a differential receiver removes it."
+    )
+
+
+def _named(names: Sequence[str], figures: Sequence[str]) -> str:
+    shown = [f"{name} ({figure})" for name, figure in zip(names, figures, strict=True)]
+    more = f" and {len(shown) - _MOST_NAMES} more" if len(shown) > _MOST_NAMES else ""
+    return ", ".join(shown[:_MOST_NAMES]) + more
+
+
+WORDS: dict[str, Callable[..., str]] = {
+    "note": _note,
+    "not settled": _not_settled,
+    "not converged": _not_converged,
+    "large median": _large_median,
+    "edge left out": _edge_left_out,
+    "image lost": _image_lost,
+    "few points": _few_points,
+    "positions contradict": _positions_contradict,
+    "positions scatter": _positions_scatter,
+    "heights drift": _heights_drift,
+    "no heights": _no_heights,
+    "focal and height": _focal_and_height,
+    "at bound": _at_bound,
+    "focal moved": _focal_moved,
+    "principal point off": _principal_point_off,
+    "weak positions": _weak_positions,
+    "common offset": _common_offset,
+    **CONTROL_WORDS,
+}
+"""What writes each kind of finding, from its figures by name."""

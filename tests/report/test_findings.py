@@ -1,0 +1,151 @@
+"""Findings in words: every kind that the adjustment can find has a sentence, made of its figures."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import jaxba
+from jaxba.engine._key import Key
+from jaxba.engine._store import load, save
+from jaxba.report import sentence
+from jaxba.report._findings import WORDS
+from jaxba.scene import Finding
+
+NAN = float("nan")
+CASES = [
+    (Finding.of("note", text="A note."), "A note."),
+    (
+        Finding.of("not settled", medians_px=[1.0, 0.8, 0.55]),
+        "changed after 3 rounds (1.00, 0.80, 0.55 px); set adjust",
+    ),
+    (Finding.of("not converged", advice="look there."), "The last solve: look there."),
+    (Finding.of("large median", median_px=4.25), "The median error is 4.2 px: check the focal length"),
+    (Finding.of("edge left out", name="a, b", reason="off"), "Edge left out: a, b: off."),
+    (Finding.of("image lost", name="a", reason="off"), "Image lost in the adjustment: a: off."),
+    (
+        Finding.of("few points", names=["a", "b"], points=[7, 12], least=20),
+        "2 images with fewer than 20 points, so weakly placed: a (7 points), b (12 points). More overlap",
+    ),
+    (
+        Finding.of("positions contradict", names=["a"], residual_m=[[-2.0, 0.04, NAN]], measured=12, sigmas=3.0),
+        "1 measured position of 12 contradict the photos by more than 3 robust sigmas and hardly count (adjusted "
+        "minus measured, east, north, up): a (-2.0, +0.0, none m).",
+    ),
+    (
+        Finding.of("positions scatter", axes=["east", "up"], scale_m=[0.2, 1.0], stated_m=[0.03, 0.06]),
+        "(east 0.2 m instead of 0.03 m, up 1 m instead of 0.06 m); the sigmas were enlarged to that.",
+    ),
+    (Finding.of("heights drift", drift_m=80.04, share=0.97), "drift against the photos by 80.0 m from"),
+    (Finding.of("no heights"), "No measured height is used, so the block's height and its tilt"),
+    (
+        Finding.of(
+            "focal and height",
+            parameter="fx",
+            focal_px=1000.0,
+            std_px=30.0,
+            height_m=50.0,
+            looks="down",
+            above_ground_m=46.0,
+            above_take_off_m=40.0,
+        ),
+        "trade off (photos look straight down): fx is 1000.0 px with a sigma of 30.0 px (3.0%), which alone makes the "
+        "height above ground of 50.0 m uncertain by 1.5 m. The cameras are 46.0 m above the ground points by the "
+        "adjustment and 40.0 m above the take-off point by the flight's own record (+15%); a focal length of 870 px",
+    ),
+    (
+        Finding.of("focal and height", parameter="f", focal_px=1000.0, std_px=30.0, height_m=50.0, looks="around"),
+        "Focal length and height trade off: f is 1000.0 px with a sigma of 30.0 px (3.0%), which alone makes the "
+        "height above ground of 50.0 m uncertain by 1.5 m. Hold the focal length",
+    ),
+    (
+        Finding.of("at bound", camera="DJI", parameter="k1", value=-0.5, low=-0.5, high=0.5),
+        "Camera DJI: k1 is at its bound (-0.5, allowed -0.5 to 0.5): the calibration",
+    ),
+    (
+        Finding.of("focal moved", camera="DJI", parameter="fx", value=900.0, before=1000.0),
+        "Camera DJI: fx moved from 1000 to 900 px (-10.0%). Compare",
+    ),
+    (
+        Finding.of("principal point off", camera="DJI", parameter="cx", value=660.0, middle=600.0),
+        "Camera DJI: the principal point's cx is +60 px off the middle",
+    ),
+    (
+        Finding.of("weak positions", names=[f"p{i}" for i in range(12)], std_m=[0.5] * 12, median_m=0.02),
+        "12 images with a position sigma over five times the median of 0.02 m: p0 (0.5 m)",
+    ),
+    (Finding.of("common offset", median_m=0.02, receiver_std_m=3.0), "up to their own sigma of 3.0 m horizontally"),
+    (Finding.of("control without a place"), "The block has no place on earth"),
+    (
+        Finding.of("control not marked twice", names=["g1", "g2"], marks=[1, 0]),
+        "not used: g1 (1 mark), g2 (0 marks). Mark",
+    ),
+    (
+        Finding.of("few control points", count=2, least=3, is_fit=True),
+        "2 control points can be used where 3 are needed, so no fit",
+    ),
+    (Finding.of("few control points", count=2, least=3, is_fit=False), "so they do not fix the block by themselves"),
+    (Finding.of("control on a line", count=4), "The 4 control points lie on a line"),
+    (Finding.of("control horizontal only"), "Control is horizontal only and no position has a height"),
+    (Finding.of("marks contradict", marks=[["g1", "a.jpg"]], std_px=1.0), "left out: g1 in a.jpg. Look at them."),
+    (
+        Finding.of("marks off", median_px=9.0, std_px=1.0),
+        "Marks miss their points by 9.0 px in the median (sigma 1 px)",
+    ),
+    (Finding.of("marks disagree", marks=2, name="g1", rms_px=8.0), "The 2 marks of g1 do not agree (RMS 8.0 px)"),
+    (
+        Finding.of(
+            "control scatters", count=5, axes=["horizontally", "in height"], scatter_m=[0.5, 1.0], stated_m=[0.02, 0.03]
+        ),
+        "The 5 control points contradict the block, most of them and not one: they scatter by 0.5 m horizontally where "
+        "their sigma is 0.02 m, 1 m in height where their sigma is 0.03 m. Their sigmas were enlarged",
+    ),
+    (
+        Finding.of(
+            "control point contradicts",
+            name="g1",
+            is_check=False,
+            residual_m=[0.5, -0.1, NAN],
+            over_sigma=9.0,
+            limit=3.29,
+            method="adjust",
+        ),
+        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, none m east, north, up, 9.0 "
+        "sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name and its marks. "
+        "It pulls the block no harder",
+    ),
+    (
+        Finding.of("gnss off control", offset_m=[1.5, -2.0, NAN], std_m=[0.03, 0.03, 0.06], is_compared=False),
+        "as control places it: +1.50, -2.00, unknown m east, north, up, for all photos in common, with sigmas of 0.03, "
+        "0.03, 0.06 m; the block follows control. Decimetres",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Kept:
+    findings: tuple[Finding, ...]
+
+
+@pytest.mark.parametrize(("finding", "words"), CASES, ids=[finding.kind for finding, _ in CASES])
+def test_a_finding_is_told_with_its_figures(finding: Finding, words: str):
+    assert words in sentence(finding)
+
+
+def test_more_than_ten_photos_are_counted():
+    finding = next(finding for finding, _ in CASES if finding.kind == "weak positions")
+    assert sentence(finding).endswith("p9 (0.5 m) and 2 more.")
+
+
+def test_every_kind_that_can_be_found_has_words_and_a_case():
+    folder = Path(jaxba.__file__).parent / "sfm"
+    sources = "".join(path.read_text() for path in folder.glob("*findings.py"))
+    found = set(re.findall(r'Finding\.of\(\s*"([^"]+)"', sources))
+    assert found == set(WORDS) == {finding.kind for finding, _ in CASES}
+
+
+def test_findings_are_told_alike_after_they_were_stored(tmp_path: Path):
+    save(tmp_path / "kept", Kept(tuple(finding for finding, _ in CASES)), Key("code", {}, {}))
+    again = load(tmp_path / "kept", Kept).findings
+    assert [sentence(finding) for finding in again] == [sentence(finding) for finding, _ in CASES]

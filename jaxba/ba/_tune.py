@@ -83,7 +83,10 @@ def tune(
       and of what is held out.
     - `callback`: called with the number of each step and the scores. Ctrl-C ends with the best so far.
 
-    Raises `JaxbaError` for names that cannot be learned, and for check points that are control points of the fit.
+    Needs optax: `pip install 'jaxba[tune]'`.
+
+    Raises `JaxbaError` without it, for names that cannot be learned, and for check points that are control points of
+    the fit.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(8, outlier_fraction=0.1)
@@ -92,8 +95,10 @@ def tune(
     >>> tuned.learned["loss scale"] < 10.0, bool(tuned.history[-1, 0] < tuned.history[0, 0])  # doctest: +SKIP
     (True, True)
     """
-    import optax  # not needed by anything else
-
+    try:
+        import optax  # not needed by anything else
+    except ImportError as error:
+        raise JaxbaError("tune needs optax, which is not installed: pip install 'jaxba[tune]'.") from error
     if (check_points is None) == (hold_out is None):
         raise JaxbaError("tune: give check_points or hold_out, one of them: the data to be judged by.")
     if steps < 1 or starts < 1:

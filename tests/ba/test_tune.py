@@ -1,5 +1,7 @@
 """Tuning against the truth of simulated surveys, and what it refuses."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -63,6 +65,12 @@ def test_several_starts_at_once_end_at_the_best(survey: jaxba.synthetic.Survey):
 def test_what_cannot_be_tuned_is_refused(survey: jaxba.synthetic.Survey, options: dict, message: str):
     with pytest.raises(JaxbaError, match=message):
         jaxba.tune(survey.problem, loss=jaxba.Huber(1.0), **options)
+
+
+def test_tuning_without_optax_names_the_extra(survey: jaxba.synthetic.Survey, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "optax", None)
+    with pytest.raises(JaxbaError, match=r"pip install 'jaxba\[tune\]'"):
+        jaxba.tune(survey.problem, loss=jaxba.Huber(1.0), hold_out=0.1)
 
 
 def test_a_check_point_must_not_be_control_of_the_fit():

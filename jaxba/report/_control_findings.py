@@ -81,8 +81,8 @@ def _contradicts(
     part = "" if is_check else _PARTS.get(method, "")
     return (
         f"{'Check' if is_check else 'Control'} point {name} contradicts the block: adjusted minus surveyed {residual} "
-        f"m east, north, up, {over_sigma:.1f} sigmas where {limit:g} are exceeded by chance in one of a thousand. Check "
-        f"its coordinates, its name and its marks.{part}"
+        f"m east, north, up, {over_sigma:.1f} sigmas where {limit:g} are exceeded by chance in one of a thousand. "
+        f"Check its coordinates, its name and its marks.{part}"
     )
 
 

@@ -68,12 +68,13 @@ def minimise(
     """Run the solver step by step from the problem's start values, at most 300 steps."""
     plan, system, unknowns = solver_view(problem, loss, linear_solver)
     init, step = _init_and_step(solver)
-    state = init(unknowns, system)
+    unknowns, state = jax.device_get((unknowns, init(unknowns, system)))
     for _ in range(300):
-        unknowns, state = step(unknowns, state, system)
+        # fetched, the first step's arguments have the types of the others', and share their program
+        unknowns, state = jax.device_get(step(unknowns, state, system))
         if int(state.status) != RUNNING:
             break
-    return Minimum(jax.device_get(restore(unknowns, problem, plan)), jax.device_get(state), plan)
+    return Minimum(restore(unknowns, problem, plan), state, plan)
 
 
 @functools.cache

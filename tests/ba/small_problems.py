@@ -167,3 +167,13 @@ def small_problem(
         lever_arm=measured_arm,
     )
     return eqx.tree_at(lambda p: p.free.lever_arm, problem, np.array(lever_arm))
+
+
+def bounded(problem: Problem, half_width: float) -> Problem:
+    """Bound each camera's focal length and last parameter about its start values, by so many times 1 px or 0.01."""
+    names = problem.cameras.parameter_names()
+    lower, upper = problem.lower.copy(), problem.upper.copy()
+    for column, width in ((0, 1.0), (len(names) - 1, 1.0 if names[-1].startswith("c") else 0.01)):
+        start = np.asarray(getattr(problem.cameras, names[column]))
+        lower[:, column], upper[:, column] = start - half_width * width, start + half_width * width
+    return eqx.tree_at(lambda p: (p.lower, p.upper), problem, (lower, upper))

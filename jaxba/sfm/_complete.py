@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba._projection import project_in_cameras
+from jaxba.ba import project_in_cameras
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Features, Photo, Tracks
 

@@ -24,8 +24,7 @@ import pycolmap.cost_functions as costs
 from benchmarks.cost import reprojection
 from benchmarks.record import HistoryRow, Record, Values
 from jaxba._errors import JaxbaError
-from jaxba.ba import PositionPrior, Problem
-from jaxba.ba._problem import AbstractPrior
+from jaxba.ba import AbstractPrior, PositionPrior, Problem
 from jaxba.geometry import AbstractLoss
 
 _MODELS = {

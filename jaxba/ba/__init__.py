@@ -1,19 +1,23 @@
 """The solver: problem, residual groups, normal equations, Schur reduction, solve."""
 
+from jaxba.ba._check import Dropped, Prepared, prepare
 from jaxba.ba._check_gradients import GradientCheck, GradientRow, check_gradients
+from jaxba.ba._compiler import fast_jit
 from jaxba.ba._covariance import Covariance, covariance
 from jaxba.ba._gauge import free_gauge
-from jaxba.ba._plan import Plan, make_plan
+from jaxba.ba._plan import Plan, PlanShape, make_plan
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
+from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
 from jaxba.ba._reject import Rejected, solve_and_reject
-from jaxba.ba._rows import Rows, Step, Unknowns
+from jaxba.ba._rows import JacobianBlock, Rows, Step, Unknowns
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt, residuals
 from jaxba.ba._tune import Tuned, tune
 from jaxba.ba.groups import (
     PRIORS,
+    AspectPrior,
     AttitudePrior,
     ControlPointPrior,
     IntrinsicsPrior,
@@ -24,19 +28,24 @@ from jaxba.ba.groups import (
 __all__ = [
     "PRIORS",
     "AbstractPrior",
+    "AspectPrior",
     "AttitudePrior",
     "ControlPointPrior",
     "Covariance",
+    "Dropped",
     "Free",
     "GradientCheck",
     "GradientRow",
     "GroupErrors",
     "HistoryStep",
     "IntrinsicsPrior",
+    "JacobianBlock",
     "LeverArmPrior",
     "Observations",
     "Plan",
+    "PlanShape",
     "PositionPrior",
+    "Prepared",
     "Problem",
     "Quality",
     "Rejected",
@@ -50,8 +59,11 @@ __all__ = [
     "Unknowns",
     "check_gradients",
     "covariance",
+    "fast_jit",
     "free_gauge",
     "make_plan",
+    "prepare",
+    "project_in_cameras",
     "quality",
     "reprojection_errors",
     "residuals",

@@ -113,9 +113,16 @@ class Prepared:
 
 
 def prepare(problem: Problem) -> Prepared:
-    """Return the problem that can be solved, on the host.
+    """Return the problem that can be solved, on the host, and what of the given one was left out for it.
 
-    Raises `JaxbaError` where the problem contradicts itself, or where nothing of it can be solved.
+    `solve` and `covariance` begin with it. Raises `JaxbaError` where the problem contradicts itself, or where nothing
+    of it can be solved.
+
+    >>> import jaxba
+    >>> survey = jaxba.synthetic.uav_block(8)
+    >>> prepared = jaxba.ba.prepare(survey.problem)
+    >>> prepared.dropped.summary(), prepared.problem is survey.problem
+    ([], True)
     """
     validate(problem)
     seen, free = problem.observations, problem.free

@@ -16,7 +16,9 @@ _FAST = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level":
 
 
 def fast_jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function jitted with `compiler_options`; its arguments' leaves are arrays.
+    """Return the function jitted to compile fast, for programs that run some tens of times (`compiler_options`).
+
+    Its arguments' leaves are arrays; nothing compiles, and no backend starts, before the first call.
 
     >>> import numpy as np
     >>> fast_jit(lambda x: 2 * x)(np.ones(2)).tolist()

@@ -39,8 +39,11 @@ LinearSolver = Literal["auto", "dense", "banded", "cg"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
-    """Sizes and choices that the compiled code depends on; equal shapes share compiled code."""
+class PlanShape:
+    """A plan's sizes and choices that the compiled code depends on; equal shapes share compiled code.
+
+    Padding is counted in. `make_plan(..., like=plan.shape)` makes a plan of at least these sizes.
+    """
 
     num_images: int
     num_points: int
@@ -81,7 +84,7 @@ class Shape:
         return self.num_shared_cameras * self.num_refined + (3 if self.lever_arm else 0)
 
 
-_NOTHING = Shape(
+_NOTHING = PlanShape(
     num_images=0, num_points=0, num_rows=0, chunk_runs=0, num_cameras=0, refined=(), own_cameras=False, lever_arm=False,
     any_fixed_pose=False, any_fixed_point=False, any_bound=False, num_pair_runs=0, num_blocks=0, linear_solver="dense",
     panel_images=1, band_panels=0,
@@ -107,11 +110,11 @@ class Plan(eqx.Module):
     block_row: Int[Array | np.ndarray, " blocks"]
     block_column: Int[Array | np.ndarray, " blocks"]
     """Images of each off-diagonal block, row > column; padding repeats the last image in both."""
-    shape: Shape = eqx.field(static=True)
+    shape: PlanShape = eqx.field(static=True)
 
 
 def make_plan(
-    problem: Problem, *, linear_solver: LinearSolver = "auto", like: Shape | None = None, spare: float = 0.0
+    problem: Problem, *, linear_solver: LinearSolver = "auto", like: PlanShape | None = None, spare: float = 0.0
 ) -> Plan:
     """Return the plan of a problem, whose indices and `free` masks must be concrete (not traced).
 
@@ -158,7 +161,7 @@ def make_plan(
     blocks = np.full(num_blocks, num_images * num_images - 1, np.int64)
     blocks[: len(runs.blocks)] = runs.blocks
 
-    shape = Shape(
+    shape = PlanShape(
         num_images=num_images,
         num_points=num_points,
         num_rows=num_rows,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxba.ba._problem import AbstractPrior
 from jaxba.ba._robust import reweighting
-from jaxba.ba._rows import Block, Rows, Step, Unknowns, rows_of, segments, sum_components
+from jaxba.ba._rows import JacobianBlock, Rows, Step, Unknowns, rows_of, segments, sum_components
 from jaxba.ba._system import System
 
 
@@ -25,10 +25,10 @@ def robust_rows(system: System, prior: AbstractPrior, unknowns: Unknowns, bend: 
     def robust(jacobian: Array) -> Array:
         return jnp.stack(reweighted(list(jacobian)))
 
-    def block(block: Block | None, mask: Array | np.ndarray) -> Block | None:
+    def block(block: JacobianBlock | None, mask: Array | np.ndarray) -> JacobianBlock | None:
         if block is None:
             return None
-        return Block(block.index, robust(block.jacobian) * rows_of(mask, block.index).T[None])
+        return JacobianBlock(block.index, robust(block.jacobian) * rows_of(mask, block.index).T[None])
 
     lever_arm = None if rows.lever_arm is None else robust(rows.lever_arm) * free.lever_arm[:, None]
     return Rows(
@@ -152,7 +152,7 @@ def _add(blocks: PriorBlocks, rows: Rows, matrix: Float[Array, "rows columns col
 def transpose_product(rows: Rows, values: Float[Array, "components rows"], zero: Step) -> Step:
     """Return `J^T v`; `zero` gives the shapes."""
 
-    def of_kind(block: Block | None, zero: Array | np.ndarray) -> Array:
+    def of_kind(block: JacobianBlock | None, zero: Array | np.ndarray) -> Array:
         return jnp.asarray(zero) if block is None else block_transpose(block, values, zero.shape[0])
 
     lever_arm = zero.lever_arm
@@ -166,11 +166,13 @@ def transpose_product(rows: Rows, values: Float[Array, "components rows"], zero:
     )
 
 
-def block_transpose(block: Block, values: Float[Array, "components rows"], count: int) -> Float[Array, "m columns"]:
+def block_transpose(
+    block: JacobianBlock, values: Float[Array, "components rows"], count: int
+) -> Float[Array, "m columns"]:
     """Return `J^T v` of one block, summed by what its rows touch."""
     return segments(sum_components(block.jacobian * values[:, None]).T, block.index, count)
 
 
-def block_products(block: Block, count: int) -> Float[Array, "m columns columns"]:
+def block_products(block: JacobianBlock, count: int) -> Float[Array, "m columns columns"]:
     """Return `J^T J` of one block, summed by what its rows touch."""
     return segments(jnp.einsum("cin,cjn->nij", block.jacobian, block.jacobian), block.index, count)

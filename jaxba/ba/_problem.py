@@ -34,7 +34,7 @@ class Observations(eqx.Module):
 
 
 class AbstractPrior(eqx.Module):
-    """A residual group beside the reprojections: one file in `ba/groups`, one line in its table.
+    """A residual group beside the reprojections: a class of your own, or one of those in `ba/groups`.
 
     `name` is the group's name in files, tables and messages. `loss` is applied to the squared norm of each row's
     residual, which is already divided by its sigmas.

@@ -42,7 +42,17 @@ def project(
 def project_in_cameras(
     cameras: AbstractCamera, camera: Int[np.ndarray, " rows"], point_in_cam: Float[np.ndarray, "3 rows"]
 ) -> Float[np.ndarray, "2 rows"]:
-    """Return the pixels of points, each in one of a batch of cameras; not finite where the model has none."""
+    """Return the pixels of points, each in one of a batch of cameras; not finite where the model has none.
+
+    - `cameras`: one model, its fields with one entry a camera. `camera`: the camera of each point.
+    - `point_in_cam`: metres, in the frame of its camera.
+
+    >>> import numpy as np
+    >>> from jaxba.geometry import SimplePinhole
+    >>> cameras = SimplePinhole(np.array([1000.0, 2000.0]), np.full(2, 500.0), np.full(2, 400.0))
+    >>> project_in_cameras(cameras, np.array([0, 1]), np.array([[1.0, 1.0], [0.0, 0.0], [10.0, 10.0]])).tolist()
+    [[600.0, 700.0], [400.0, 400.0]]
+    """
     count = point_in_cam.shape[1]
     fields = [np.atleast_1d(np.asarray(getattr(cameras, name), float)) for name in cameras.parameter_names()]
     xy_px = np.empty((2, count))

@@ -43,8 +43,12 @@ class Unknowns(eqx.Module):
         )
 
 
-class Block(eqx.Module):
-    """Derivatives of rows by one kind of unknown, and which one of its kind each row touches."""
+class JacobianBlock(eqx.Module):
+    """Derivatives of a prior's rows by one kind of unknown.
+
+    - `index`: which one of its kind each row touches.
+    - `jacobian`: by its tangent step, 6 columns for a pose, 3 for a point, one a parameter for intrinsics.
+    """
 
     index: Int[Array | np.ndarray, " rows"]
     jacobian: Float[Array, "components columns rows"]
@@ -57,10 +61,10 @@ class Rows(eqx.Module):
     """
 
     residual: Float[Array, "components rows"]
-    pose: Block | None = None
-    intrinsics: Block | None = None
+    pose: JacobianBlock | None = None
+    intrinsics: JacobianBlock | None = None
     lever_arm: Float[Array, "components 3 rows"] | None = None
-    point: Block | None = None
+    point: JacobianBlock | None = None
 
 
 def rows_of(values: Array | np.ndarray, index: Int[Array | np.ndarray, "..."]) -> Array:

@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from jaxba.ba._check import Prepared, prepare
-from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, Shape, bucket, make_plan
+from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, PlanShape, bucket, make_plan
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._rows import Step, Unknowns
 from jaxba.ba.groups import Reprojection
@@ -43,7 +43,7 @@ class System(eqx.Module):
     pair_block: Int[Array | np.ndarray, " pair_runs"]
     block_row: Int[Array | np.ndarray, " blocks"]
     block_column: Int[Array | np.ndarray, " blocks"]
-    shape: Shape = eqx.field(static=True)
+    shape: PlanShape = eqx.field(static=True)
 
 
 def structured(problem: Problem, plan: Plan | None, linear_solver: LinearSolver) -> tuple[Prepared, Plan]:

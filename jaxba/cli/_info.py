@@ -9,8 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from jaxba.ba import AbstractPrior, Problem, Unknowns, free_gauge, quality
-from jaxba.ba._check import Prepared, prepare
+from jaxba.ba import AbstractPrior, Prepared, Problem, Unknowns, free_gauge, prepare, quality
 from jaxba.cli._result import intrinsics
 from jaxba.cli._text import first_of, gauge_text, many, table, to_json
 from jaxba.engine._compile_cache import use_compilation_cache

@@ -33,8 +33,7 @@ from jaxba.io._list_text import (
     read_number,
     refuse_degrees_out_of_range,
 )
-from jaxba.scene import Position
-from jaxba.scene._photo import HeightKind
+from jaxba.scene import HeightKind, Position
 
 _COLUMNS = {
     **PLACE_COLUMNS,

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from jaxba._errors import JaxbaError
-from jaxba.scene._photo import HeightKind
+from jaxba.scene import HeightKind
 
 Line = tuple[int, str]
 """Number of a line, from 1, and its text."""

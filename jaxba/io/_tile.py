@@ -11,8 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import PRIORS, Free, Observations, Problem
-from jaxba.ba._problem import AbstractPrior
+from jaxba.ba import PRIORS, AbstractPrior, Free, Observations, Problem
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Pose
 from jaxba.io._atomic import write_atomically
 from jaxba.io._check import check_arrays, check_names

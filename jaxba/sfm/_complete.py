@@ -23,7 +23,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba._projection import project_in_cameras
+from jaxba.ba import project_in_cameras
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Features, Photo, Tracks
 

@@ -26,6 +26,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxba.ba import (
+    AbstractPrior,
+    AspectPrior,
     AttitudePrior,
     ControlPointPrior,
     IntrinsicsPrior,
@@ -34,10 +36,8 @@ from jaxba.ba import (
     Problem,
     Solution,
 )
-from jaxba.ba._problem import AbstractPrior
 from jaxba.geometry import CAMERAS, Cauchy, GemanMcClure, Linear, Pose
 from jaxba.scene import Block, Photo, Reference
-from jaxba.sfm._aspect import AspectPrior
 from jaxba.sfm._control import CONTROL_LOSS, ControlPart
 
 POSITION_LOSS = GemanMcClure(4.0)

@@ -19,7 +19,7 @@ from jax import Array
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba._compiler import fast_jit
+from jaxba.ba import fast_jit
 from jaxba.geometry import CAMERAS, AbstractCamera
 from jaxba.scene import Block
 

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba._compiler import fast_jit
+from jaxba.ba import fast_jit
 from jaxba.geometry import CAMERAS, AbstractCamera
 from jaxba.scene import Block
 from jaxba.sfm._sparse import block_diagonal, block_matrix, solve_positive, sum_rows

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba.ba import Problem, Solution, make_plan, reprojection_errors, solve
-from jaxba.ba._plan import Shape
+from jaxba.ba import PlanShape, Problem, Solution, make_plan, reprojection_errors, solve
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
 from jaxba.scene import Block, Control, Photo, Reference, Tracks
 from jaxba.sfm._control import (
@@ -57,7 +56,7 @@ class Rounds:
         std_px: float,
         free: Sequence[str],
         mark_used: Bool[np.ndarray, " marks"],
-        shape: Shape | None,
+        shape: PlanShape | None,
         *,
         max_nfev: int,
         is_later: bool,
@@ -117,7 +116,7 @@ class Rounds:
         error_px = error_px[: block.num_observations]
         return Solved(block, error_px, problem, loss, solution, scale, offset_m, control)
 
-    def shape(self, block: Block, tracks: Tracks) -> Shape:
+    def shape(self, block: Block, tracks: Tracks) -> PlanShape:
         """Return the shape of the block with every observation that may ever join it: all rounds share it."""
         row, image_row, of_track, index = track_rows(block, tracks)
         full = dataclasses.replace(

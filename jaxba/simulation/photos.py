@@ -30,7 +30,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
-from jaxba.engine._parameters import Parameters, parameter
+from jaxba.engine import Parameters, parameter
 from jaxba.geo import geodetic_from_local, projected_from_local
 from jaxba.geometry import OpenCV
 from jaxba.io import cannot_write, write_atomically

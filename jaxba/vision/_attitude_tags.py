@@ -18,7 +18,7 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxba.scene._attitude import Attitude
+from jaxba.scene import Attitude
 from jaxba.vision._exif import Tags
 
 _GIMBALS = (

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.scene._photo import FocalSource
+from jaxba.scene import FocalSource
 from jaxba.vision._exif import BASE, Tags, number
 from jaxba.vision._sensors import Sensor, find_sensor, scale_of
 

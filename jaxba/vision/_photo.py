@@ -3,7 +3,7 @@
 import datetime
 
 from jaxba._errors import JaxbaError
-from jaxba.scene._photo import Photo, PhotoFile
+from jaxba.scene import Photo, PhotoFile
 from jaxba.vision._attitude_tags import find_attitudes
 from jaxba.vision._exif import BASE, Tags, number, read_tags, text
 from jaxba.vision._focal import find_focal

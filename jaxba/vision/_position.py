@@ -17,7 +17,7 @@ from typing import Any
 
 from PIL import ExifTags
 
-from jaxba.scene._photo import Fix, HeightKind, Position
+from jaxba.scene import Fix, HeightKind, Position
 from jaxba.vision._exif import GPS, Tags, number, text
 
 _EXIF_ROUNDING_DEG = 5e-7

@@ -11,8 +11,7 @@ from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 from small_problems import EVERY_CAMERA, small_problem
 
-from jaxba.ba import AttitudePrior, Rows, Step, Unknowns
-from jaxba.ba._problem import AbstractPrior
+from jaxba.ba import AbstractPrior, AspectPrior, AttitudePrior, Rows, Step, Unknowns
 from jaxba.ba.groups import PRIORS, Reprojection
 from jaxba.geometry import Pose
 
@@ -63,6 +62,16 @@ def assert_rows_equal_jacfwd(prior: AbstractPrior, unknowns: Unknowns, tolerance
 @pytest.mark.parametrize("name", PRIORS)
 def test_derivatives_of_every_prior_equal_jacfwd(name):
     assert_rows_equal_jacfwd(PROBLEM.prior(name), UNKNOWNS)
+
+
+def test_derivatives_of_an_aspect_equal_jacfwd_and_its_residual_the_formula():
+    prior = AspectPrior(camera_index=np.array([1, 0]), ratio=np.array([1.0, 1.01]), std=np.array([1e-3, 2e-3]))
+    focal = np.random.default_rng(0).uniform(800, 1200, UNKNOWNS.intrinsics.shape)
+    unknowns = eqx.tree_at(lambda u: u.intrinsics, UNKNOWNS, jnp.asarray(focal))
+    assert_rows_equal_jacfwd(prior, unknowns)
+    fx, fy = focal.T[:2]
+    expected = [(fx[1] / fy[1] - 1) / 1e-3, (fx[0] / fy[0] - 1.01) / 2e-3]
+    np.testing.assert_allclose(prior.residual(unknowns)[0], expected, rtol=1e-12)
 
 
 # about half a turn the rotation vector jumps; beside it the derivative of arctan2 loses four digits

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from simulated import Simulated, simulate
 
-from jaxba.ba import Unknowns, free_gauge
-from jaxba.geometry import Pose
+from jaxba.ba import free_gauge
 from jaxba.scene import Block
 from jaxba.sfm import free_parameters, to_problem, with_points
-from jaxba.sfm._aspect import AspectPrior
 from jaxba.sfm._problem import is_collinear
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -95,20 +93,3 @@ def test_positions_on_a_line_are_told() -> None:
     along = np.linspace(0, 100, 9)[:, None] * [1.0, 0.2, 0.0]
     bent = along + np.array([0.0, 0, 1]) * (np.arange(9) % 2)[:, None] * 20
     assert is_collinear(along) and is_collinear(bent[:2]) and not is_collinear(bent)
-
-
-def test_aspect_prior_has_exact_derivatives() -> None:
-    prior = AspectPrior(camera_index=np.array([1, 0]), ratio=np.array([1.0, 1.01]), std=np.array([1e-3, 2e-3]))
-    rng = np.random.default_rng(0)
-    intrinsics = jnp.asarray(rng.uniform(800, 1200, (2, 9)))
-
-    def unknowns(values: jax.Array) -> Unknowns:
-        return Unknowns(Pose(jnp.eye(4)[:1], jnp.zeros((1, 3))), values, jnp.zeros(3), jnp.zeros((1, 3)))
-
-    rows = prior.rows(unknowns(intrinsics))
-    dense = jax.jacfwd(lambda v: prior.residual(unknowns(v)))(intrinsics)  # (1, rows, cameras, parameters)
-    assert rows.intrinsics is not None
-    for row, camera in enumerate((1, 0)):
-        np.testing.assert_allclose(rows.intrinsics.jacobian[0, :, row], dense[0, row, camera], rtol=1e-12)
-    expected = (intrinsics[1, 0] / intrinsics[1, 1] - 1) / 1e-3
-    np.testing.assert_allclose(rows.residual[0, 0], expected, rtol=1e-12)

@@ -1,6 +1,7 @@
-"""Residual groups: one file each. A new prior is one file and one line in `PRIORS`."""
+"""Residual groups: one file each. A new prior is one file and, where files are to hold it, one line in `PRIORS`."""
 
 from jaxba.ba._problem import AbstractPrior
+from jaxba.ba.groups._aspect import AspectPrior
 from jaxba.ba.groups._attitude import AttitudePrior
 from jaxba.ba.groups._control import ControlPointPrior
 from jaxba.ba.groups._intrinsics import IntrinsicsPrior
@@ -11,8 +12,9 @@ from jaxba.ba.groups._reprojection import Reprojection
 PRIORS: dict[str, type[AbstractPrior]] = {
     prior.name: prior for prior in (PositionPrior, AttitudePrior, IntrinsicsPrior, ControlPointPrior, LeverArmPrior)
 }
-"""Every prior that a problem can hold, by name; files and messages are driven by this table."""
+"""Every prior that a file can hold, by name; `tile.npz` and messages are driven by this table."""
 
 __all__ = [
-    "PRIORS", "AttitudePrior", "ControlPointPrior", "IntrinsicsPrior", "LeverArmPrior", "PositionPrior", "Reprojection",
+    "PRIORS", "AspectPrior", "AttitudePrior", "ControlPointPrior", "IntrinsicsPrior", "LeverArmPrior", "PositionPrior",
+    "Reprojection",
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._problem import AbstractPrior
-from jaxba.ba._rows import Block, Rows, Unknowns, rows_of
+from jaxba.ba._rows import JacobianBlock, Rows, Unknowns, rows_of
 from jaxba.geometry import (
     AbstractLoss,
     Linear,
@@ -46,7 +46,7 @@ class AttitudePrior(AbstractPrior):
         about = jnp.moveaxis(jacobian, 0, -1)
         return Rows(
             residual=(turn / jnp.asarray(self.std_rad)).T,
-            pose=Block(self.image_index, jnp.concatenate([about, jnp.zeros_like(about)], axis=1)),
+            pose=JacobianBlock(self.image_index, jnp.concatenate([about, jnp.zeros_like(about)], axis=1)),
         )
 
     def _turn(self, unknowns: Unknowns) -> Float[Array, "rows 3"]:

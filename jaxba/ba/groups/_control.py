@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._problem import AbstractPrior
-from jaxba.ba._rows import Block, Rows, Unknowns, rows_of
+from jaxba.ba._rows import JacobianBlock, Rows, Unknowns, rows_of
 from jaxba.geometry import AbstractLoss, Linear
 
 
@@ -31,5 +31,5 @@ class ControlPointPrior(AbstractPrior):
         identity = jnp.eye(3, dtype=unknowns.points.dtype)
         return Rows(
             residual=self.residual(unknowns),
-            point=Block(self.point_index, identity[:, :, None] / jnp.asarray(self.std_m).T[None]),
+            point=JacobianBlock(self.point_index, identity[:, :, None] / jnp.asarray(self.std_m).T[None]),
         )

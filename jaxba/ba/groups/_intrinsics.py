@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._problem import AbstractPrior
-from jaxba.ba._rows import Block, Rows, Unknowns, rows_of
+from jaxba.ba._rows import JacobianBlock, Rows, Unknowns, rows_of
 from jaxba.geometry import AbstractLoss, Linear
 
 
@@ -32,5 +32,5 @@ class IntrinsicsPrior(AbstractPrior):
         identity = jnp.eye(num_parameters, dtype=unknowns.intrinsics.dtype)
         return Rows(
             residual=self.residual(unknowns),
-            intrinsics=Block(self.camera_index, identity[:, :, None] / jnp.asarray(self.std).T[None]),
+            intrinsics=JacobianBlock(self.camera_index, identity[:, :, None] / jnp.asarray(self.std).T[None]),
         )

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._problem import AbstractPrior
-from jaxba.ba._rows import Block, Rows, Unknowns, rotation_rows, rows_of
+from jaxba.ba._rows import JacobianBlock, Rows, Unknowns, rotation_rows, rows_of
 from jaxba.geometry import AbstractLoss, Linear
 
 
@@ -48,6 +48,6 @@ class PositionPrior(AbstractPrior):
         ]
         return Rows(
             residual=self.residual(unknowns),
-            pose=Block(self.image_index, jnp.concatenate([jnp.stack(turn, axis=1), -transposed], axis=1)),
+            pose=JacobianBlock(self.image_index, jnp.concatenate([jnp.stack(turn, axis=1), -transposed], axis=1)),
             lever_arm=transposed,
         )

@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.ba import AbstractPrior, Rows, Unknowns
-from jaxba.ba._rows import Block, rows_of
+from jaxba.ba._problem import AbstractPrior
+from jaxba.ba._rows import JacobianBlock, Rows, Unknowns, rows_of
 from jaxba.geometry import AbstractLoss, Linear
 
 
@@ -35,7 +35,7 @@ class AspectPrior(AbstractPrior):
         parameters = unknowns.intrinsics.shape[1]
         jacobian = jnp.zeros((1, parameters, fx.shape[0]), fx.dtype)
         jacobian = jacobian.at[0, 0].set(1 / fy).at[0, 1].set(-fx / fy**2) / jnp.asarray(self.std)
-        return Rows(residual=self.residual(unknowns), intrinsics=Block(self.camera_index, jacobian))
+        return Rows(residual=self.residual(unknowns), intrinsics=JacobianBlock(self.camera_index, jacobian))
 
     def _focal(self, unknowns: Unknowns) -> tuple[Array, Array]:
         values = rows_of(unknowns.intrinsics, self.camera_index)

@@ -16,6 +16,7 @@ from jaxba import JaxbaError
 from jaxba.engine import changed, from_toml
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.pipeline import NAMES, PIPELINE, Event, adjust, run_pipeline, start
+from jaxba.scene import Finding
 
 FIRST, LAST = "SIM_0001.JPG", f"SIM_{NUM_PHOTOS:04d}.JPG"
 

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from jaxba.scene import Photo, Reference
 
@@ -125,6 +124,8 @@ def _height_ratio(height_m: Float[np.ndarray, " photos"]) -> float:
 
 
 def _oblique_share(reference: Reference) -> float:
+    from scipy.spatial.transform import Rotation
+
     known = np.isfinite(reference.quaternion).all(axis=1)
     if not known.any():
         return np.nan

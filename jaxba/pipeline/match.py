@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.pipeline._fallback import FallbackKeypoints, detect_fallback
@@ -258,6 +257,8 @@ def _edge(
     missed: Missed,
 ) -> ViewGraph:
     """Return the view graph of one pair."""
+    from scipy.spatial.transform import Rotation
+
     inliers = matches[two_view.is_inlier]
     status = EdgeStatus.REJECTED
     if missed not in (Missed.MATCHES, Missed.VERIFIED):
@@ -299,6 +300,8 @@ def _threshold_px(first: Photo, second: Photo, overlap: float) -> float:
 
 def _prior(reference: Reference, i: int, j: int) -> PosePrior | None:
     """Return what the attitudes of two images, and their positions, tell of their relative pose."""
+    from scipy.spatial.transform import Rotation
+
     quaternions = reference.quaternion[[i, j]]
     if not np.isfinite(quaternions).all():
         return None

@@ -1,4 +1,7 @@
-"""Host data around an adjustment: photos, features, view graph, tracks, blocks, control (numpy alone)."""
+"""Host data around an adjustment: photos, features, view graph, tracks, blocks, control (numpy alone).
+
+scipy is imported inside the functions that need it: it takes 0.35 s, and most commands and workers call none of them.
+"""
 
 from jaxba.scene._attitude import Attitude, cam_from_enu
 from jaxba.scene._block import Block

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +31,8 @@ def cam_from_enu(attitude: Attitude) -> Float[np.ndarray, "3 3"]:
     >>> (down @ [0, 1, 0]).round(6).tolist()  # north is at the top of a photo taken straight down
     [0.0, -1.0, 0.0]
     """
+    from scipy.spatial.transform import Rotation
+
     angles = [attitude.yaw_deg, attitude.pitch_deg, attitude.roll_deg]
     ned_from_body = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
     return _CAM_FROM_BODY @ ned_from_body.T @ _NED_FROM_ENU

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from jaxba.scene._graph import component_labels
 from jaxba.scene._view_graph import ViewGraph
@@ -19,6 +18,8 @@ def nearest_pairs(xy_m: Float[np.ndarray, "n 2"], count: int) -> Int[np.ndarray,
     count = min(count, len(xy_m) - 1)
     if count < 1:
         return np.zeros((0, 2), np.int64)
+    from scipy.spatial import KDTree
+
     found = np.asarray(KDTree(xy_m).query(xy_m, k=count + 1)[1])  # with itself, except among many at one place
     pairs = np.stack([np.repeat(np.arange(len(xy_m)), count + 1), found.reshape(-1)], axis=1)
     return rising(pairs[pairs[:, 0] != pairs[:, 1]])
@@ -41,6 +42,8 @@ def joining_pairs(
 
     One group after the other, the smallest first, gets its `count` closest pairs with the rest, until all are joined.
     """
+    from scipy.spatial import KDTree
+
     added = np.zeros((0, 2), np.int64)
     while True:
         labels = component_labels(np.concatenate([pairs, added]), len(xy_m))

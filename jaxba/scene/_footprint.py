@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 _MAX_TILT_RAD = np.deg2rad(70.0)  # beyond, the ground is seen under 20 degrees: too flat to match with other views
 _SIDE_POINTS = 4  # of the frame's outline, so that a side cut off by the tilt keeps its shape
@@ -55,6 +54,8 @@ def ground_footprints(
     >>> footprints.outline_m[0].max(axis=0).tolist()
     [20.0, 15.0]
     """
+    from scipy.spatial.transform import Rotation
+
     half = size_px / 2 / focal_px[:, None]
     has_attitude = np.asarray(np.isfinite(quaternion).all(axis=1))
     outline = np.full((len(size_px), 4 * _SIDE_POINTS, 2), np.nan)

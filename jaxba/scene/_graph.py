@@ -2,8 +2,6 @@
 
 import numpy as np
 from jaxtyping import Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 
 def component_labels(edges: Int[np.ndarray, "edges 2"], num_nodes: int) -> Int[np.ndarray, " nodes"]:
@@ -14,6 +12,9 @@ def component_labels(edges: Int[np.ndarray, "edges 2"], num_nodes: int) -> Int[n
     >>> component_labels(np.array([[3, 1], [4, 3]]), 5).tolist()
     [0, 1, 2, 1, 1]
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     ones = np.ones(len(edges), bool)
     _, labels = connected_components(coo_array((ones, (edges[:, 0], edges[:, 1])), (num_nodes,) * 2), directed=False)
     return number_by_first(labels)

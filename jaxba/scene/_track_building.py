@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int, UInt8
-from scipy.sparse import csr_array
 
 from jaxba.scene._features import Features
 from jaxba.scene._graph import component_labels, components, number_by_first
@@ -123,6 +122,8 @@ def _resolve(
 
 def _num_triangles(matches: Int[np.ndarray, "matches 2"], count: int) -> Int[np.ndarray, " matches"]:
     """Return with how many nodes the two ends of each match are both matched."""
+    from scipy.sparse import csr_array
+
     rows, columns = np.concatenate([matches, matches[:, ::-1]]).T
     joined = csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape=(count, count))
     joined.data[:] = 1

@@ -16,7 +16,6 @@ Three exact zeros in a gimbal's tags are what a drone writes that does not know 
 import math
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from jaxba.scene import Attitude
 from jaxba.vision._exif import Tags
@@ -52,6 +51,8 @@ def attitude_from_nadir_body(yaw_deg: float, pitch_deg: float, roll_deg: float) 
     >>> attitude_from_nadir_body(30.0, 45.0, 0.0)
     Attitude(yaw_deg=30.0, pitch_deg=-45.0, roll_deg=0.0)
     """
+    from scipy.spatial.transform import Rotation
+
     body = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True)
     matrix = (body * Rotation.from_euler("Y", -90.0, degrees=True)).as_matrix()
     pitch = math.degrees(math.asin(float(np.clip(-matrix[2, 0], -1.0, 1.0))))

@@ -10,11 +10,12 @@ from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
 from jaxba.ba._reject import Rejected, solve_and_reject
-from jaxba.ba._rows import JacobianBlock, Rows, Step, Unknowns
+from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt, residuals
 from jaxba.ba._tune import Tuned, tune
+from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.ba.groups import (
     PRIORS,
     AspectPrior,

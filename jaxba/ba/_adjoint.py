@@ -32,9 +32,10 @@ from jaxba.ba._factor import Factored, factor_reduced, smallest_pivot, solve_fac
 from jaxba.ba._hessian import hessian
 from jaxba.ba._linearise import Linearisation, cost, linearise
 from jaxba.ba._refine import refine_points
-from jaxba.ba._rows import Step, Unknowns, rows_of
+from jaxba.ba._rows import rows_of
 from jaxba.ba._schur import Reduced, back_substitute, eliminate_points, reduce_vector
 from jaxba.ba._system import System, is_traced
+from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.geometry import Linear
 
 Adjoint = Literal["implicit", "gauss_newton", "unrolled"]

@@ -18,10 +18,10 @@ from jaxtyping import Float
 
 from jaxba.ba._compiler import compiler_options
 from jaxba.ba._linearise import cost
-from jaxba.ba._rows import Unknowns
 from jaxba.ba._solution import HistoryStep
 from jaxba.ba._solvers import RUNNING, AbstractSchurSolver, State
 from jaxba.ba._system import System, without_losses
+from jaxba.ba._unknowns import Unknowns
 
 _KEPT = 32
 _SMALL = 3_000_000  # entries of all arrays

@@ -17,8 +17,9 @@ from jax import Array
 
 from jaxba.ba._linearise import Linearisation, assemble
 from jaxba.ba._priors import PriorBlocks, add_second_derivatives, robust_rows, transpose_product
-from jaxba.ba._rows import Unknowns, rows_of
+from jaxba.ba._rows import rows_of
 from jaxba.ba._system import System
+from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.groups import Reprojection
 
 

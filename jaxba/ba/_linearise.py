@@ -29,9 +29,10 @@ from jaxba.ba._priors import (
     robust_rows,
     transpose_product,
 )
-from jaxba.ba._robust import reweighting
-from jaxba.ba._rows import Step, Unknowns, rows_of, segments, sum_components
+from jaxba.ba._reweighting import reweighting
+from jaxba.ba._rows import rows_of, segments, sum_components
 from jaxba.ba._system import System
+from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.ba.groups import Reprojection
 
 

@@ -28,9 +28,9 @@ from jaxba.ba._factor import factor_reduced, factor_solve
 from jaxba.ba._linearise import linearise
 from jaxba.ba._plan import Plan
 from jaxba.ba._priors import robust_rows
-from jaxba.ba._rows import Unknowns
 from jaxba.ba._schur import Reduced, eliminate_points
 from jaxba.ba._system import System
+from jaxba.ba._unknowns import Unknowns
 
 _CHUNK = 4096
 _COLUMNS = 384  # of A^-1 solved for at a time: keeps one dense matrix in memory, not four

@@ -12,9 +12,10 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.ba._problem import AbstractPrior
-from jaxba.ba._robust import reweighting
-from jaxba.ba._rows import JacobianBlock, Rows, Step, Unknowns, rows_of, segments, sum_components
+from jaxba.ba._reweighting import reweighting
+from jaxba.ba._rows import JacobianBlock, Rows, rows_of, segments, sum_components
 from jaxba.ba._system import System
+from jaxba.ba._unknowns import Step, Unknowns
 
 
 def robust_rows(system: System, prior: AbstractPrior, unknowns: Unknowns, bend: Float[Array, ""]) -> Rows:

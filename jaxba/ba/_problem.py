@@ -15,7 +15,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._rows import Rows, Unknowns
+from jaxba.ba._rows import Rows
+from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractCamera, AbstractLoss, Pose
 
 

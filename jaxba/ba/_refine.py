@@ -18,9 +18,9 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.ba._linearise import point_costs, point_equations
-from jaxba.ba._rows import Unknowns
 from jaxba.ba._schur import solve_points
 from jaxba.ba._system import System
+from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import Linear
 
 _NEAR_BEND = 0.9

@@ -1,4 +1,4 @@
-"""What residual groups are written in: the unknowns, and rows of residuals with their derivatives.
+"""What residual groups are written in: rows of residuals with their derivatives, and how to gather and sum them.
 
 Arrays of rows are component first, rows last: `(3, n)`, not `(n, 3)`. Elementwise code over long last axes is what XLA
 turns into vector instructions on a CPU; the same formulas on `(n, 3, 6)` arrays measured ten times slower.
@@ -12,35 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
-
-from jaxba.geometry import Pose
-
-
-class Step(eqx.Module):
-    """A tangent step of all unknowns; also the shape of a gradient and of a diagonal."""
-
-    poses: Float[Array | np.ndarray, "images 6"]
-    intrinsics: Float[Array | np.ndarray, "cameras parameters"]
-    lever_arm: Float[Array | np.ndarray, "3"]
-    points: Float[Array | np.ndarray, "points 3"]
-
-
-class Unknowns(eqx.Module):
-    """Values of everything an adjustment may change; fields as in `Problem`, the intrinsics as one array."""
-
-    poses: Pose
-    intrinsics: Float[Array | np.ndarray, "cameras parameters"]
-    lever_arm: Float[Array | np.ndarray, "3"]
-    points: Float[Array | np.ndarray, "points 3"]
-
-    def retract(self, step: Step) -> "Unknowns":
-        """Return the unknowns after a step: poses along their tangent, everything else by addition."""
-        return Unknowns(
-            self.poses.retract(jnp.asarray(step.poses)),
-            self.intrinsics + step.intrinsics,
-            self.lever_arm + step.lever_arm,
-            self.points + step.points,
-        )
 
 
 class JacobianBlock(eqx.Module):

@@ -24,8 +24,9 @@ from jaxtyping import Float
 from jaxba.ba._linearise import Linearisation, refined_columns, sum_cameras, sum_runs, w_product
 from jaxba.ba._plan import ROW_RUN
 from jaxba.ba._priors import PriorBlocks
-from jaxba.ba._rows import Step, rows_of, segments
+from jaxba.ba._rows import rows_of, segments
 from jaxba.ba._system import System
+from jaxba.ba._unknowns import Step
 
 
 class Reduced(eqx.Module):

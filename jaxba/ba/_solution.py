@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from jaxba.ba._check import Dropped
 from jaxba.ba._gauge import free_gauge
 from jaxba.ba._problem import Problem
-from jaxba.ba._rows import Unknowns
 from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
+from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractCamera, Pose
 
 RESULTS = {

@@ -19,11 +19,11 @@ from jaxba.ba._adjoint import Adjoint
 from jaxba.ba._descend import descend
 from jaxba.ba._plan import LinearSolver, Plan
 from jaxba.ba._problem import Problem
-from jaxba.ba._rows import Unknowns
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solvers import AbstractSchurSolver, SchurDogleg, SchurLevenbergMarquardt
 from jaxba.ba._system import System, initial_unknowns, is_traced, make_system, restore, structured
 from jaxba.ba._traced import solve_traced
+from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractLoss, Linear
 
 Method = Literal["lm", "dogleg"]

@@ -25,9 +25,9 @@ from jaxtyping import Bool, Float, Int, PyTree
 from jaxba.ba._factor import solve_reduced
 from jaxba.ba._linearise import Linearisation, cost, curvature, linearise
 from jaxba.ba._refine import refine_points
-from jaxba.ba._rows import Step, Unknowns
 from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, reduce_vector, to_reduced
 from jaxba.ba._system import System
+from jaxba.ba._unknowns import Step, Unknowns
 
 _MIN_RATIO = 1e-3
 # Where the model foretells a decrease this exactly, damping may fall much faster than by Ceres's third: 100 images are

@@ -9,6 +9,9 @@ views: the point with the smallest sum of squared distances to the rays, a 3x3 s
 with c_i the centres and d_i the unit rays in the world. `refine_point` takes a point to the minimum of its reprojection
 error.
 
+These are for use from Python, by themselves: rays of any source and of any camera, a few views or many tracks, under
+`jit`, `vmap` and derivatives. Every observation counts; what is wrong among them is for the caller to leave out.
+
 Every function works on padded tracks at once, `(..., views, ...)` with weight 0 for padding: a hundred operations a
 view in plain elementwise code, and the angles of all pairs of rays, fused into one loop.
 """

@@ -1,16 +1,16 @@
 """Structure from motion: start values of poses and points, and the adjustment in rounds (arrays in, arrays out)."""
 
 from jaxba.sfm._adjust import Adjusted, adjust
-from jaxba.sfm._bounds import AtBound, intrinsics_at_bounds
 from jaxba.sfm._control import agreeing_marks, control_part, with_offset
 from jaxba.sfm._control_findings import control_findings
 from jaxba.sfm._control_fit import Controlled, apply_affine, apply_control
 from jaxba.sfm._control_start import place_by_control
 from jaxba.sfm._findings import GnssFit, findings, gnss_fit, height_above_ground
 from jaxba.sfm._initialise import initialise
+from jaxba.sfm._intrinsics import AtBound, free_parameters, intrinsics_at_bounds
 from jaxba.sfm._points import with_points
-from jaxba.sfm._problem import free_parameters, to_problem
-from jaxba.sfm._settings import Settings
+from jaxba.sfm._problem import to_problem
+from jaxba.sfm._rounds import Settings
 from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [

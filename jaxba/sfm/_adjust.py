@@ -23,16 +23,12 @@ from jaxba.ba import Problem, Solution
 from jaxba.geometry import AbstractLoss
 from jaxba.scene import Block, Control, Features, Left, Photo, Reference, Tracks, ViewGraph
 from jaxba.sfm._complete import complete_tracks
-from jaxba.sfm._control import (
-    ControlPart,
-    agreeing_marks,
-)
+from jaxba.sfm._control import ControlPart, agreeing_marks
 from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, without_edges
+from jaxba.sfm._intrinsics import free_parameters
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
 from jaxba.sfm._points import apply_points, triangulate_tracks
-from jaxba.sfm._problem import free_parameters
-from jaxba.sfm._rounds import Rounds, without_images
-from jaxba.sfm._settings import Settings
+from jaxba.sfm._rounds import Rounds, Settings, without_images
 
 _log = logging.getLogger(__name__)
 

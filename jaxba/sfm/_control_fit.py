@@ -25,8 +25,7 @@ from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._align import Similarity
 from jaxba.sfm._control import LEAST_TO_PLACE, Intersected, intersect, median_offset
 from jaxba.sfm._control_start import determines_tilt, fit_similarity, transformed
-from jaxba.sfm._spread import own_variance
-from jaxba.sfm._uncertainty import Uncertainty
+from jaxba.sfm._uncertainty import Uncertainty, own_variance
 
 BLUNDER = 3.29  # sigmas: one of a thousand by chance
 LEAST_OF = {"helmert": 3, "affine": 4}

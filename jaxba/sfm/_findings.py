@@ -11,8 +11,8 @@ from scipy.special import gammaincinv
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Finding, Photo, Reference
 from jaxba.sfm._adjust import Adjusted
-from jaxba.sfm._bounds import intrinsics_at_bounds
-from jaxba.sfm._problem import natural_intrinsics, used_positions
+from jaxba.sfm._intrinsics import intrinsics_at_bounds, natural_intrinsics
+from jaxba.sfm._problem import used_positions
 from jaxba.sfm._uncertainty import Uncertainty
 
 _OUTLIER = 3.0  # sigmas

@@ -3,9 +3,10 @@
 1. Rotations of all images from the edges' relative rotations (`_rotations.py`).
 2. Centres and points of a few thousand tracks, from the images alone (`_positions.py`).
 3. The similarity onto measured positions and attitudes (`_align.py`), if they determine one.
-4. A rough adjustment with the focal length and one radial term free (`_rough.py`), twice, with wrong observations left
-   out in between.
-5. Points of all tracks; images that the rotations left out from these points (`_resection.py`).
+4. A rough adjustment with the focal length and one radial term free (`_rough_adjustment.py`), twice, with wrong
+   observations left out in between.
+5. Points of all tracks; images that the rotations left out from these points (`_resection.py`), without those that too
+   little holds (`_registered.py`).
 
 The same for every survey: measured positions and attitudes place the block, and hold it in the rough adjustment, but
 no start value depends on one of them being right.
@@ -22,13 +23,13 @@ from scipy.spatial.transform import Rotation
 from jaxba._errors import JaxbaError
 from jaxba.scene import Block, Photo, Reference, Tracks, ViewGraph
 from jaxba.sfm._align import Similarity, align, attitude_rotation, look_down
-from jaxba.sfm._choose import choose_tracks, largest_angles
 from jaxba.sfm._points import with_points
-from jaxba.sfm._positions import global_positions
+from jaxba.sfm._positions import choose_tracks, global_positions, largest_angles
 from jaxba.sfm._rays import make_rays
-from jaxba.sfm._register import CONTRADICTION, contradictions, drop_weak, register_more, unregistered
+from jaxba.sfm._registered import CONTRADICTION, contradictions, drop_weak, unregistered
+from jaxba.sfm._resection import register_more
 from jaxba.sfm._rotations import average_rotations
-from jaxba.sfm._rough import adjust_roughly
+from jaxba.sfm._rough_adjustment import adjust_roughly
 from jaxba.sfm._start_cameras import StartCameras, used_cameras
 
 _log = logging.getLogger(__name__)
@@ -73,7 +74,7 @@ def initialise(
     block = cameras.block(start.image_index, start.quaternion)
     _log.info("positions of %d images", block.num_images)
     chosen, block = _positions(block, tracks, photos, min_angle_rad)
-    block = _place(block, reference, notes)
+    block = _in_local_frame(block, reference, notes)
     focal_std = cameras.focal_std
     longer = float(max(max(p.width_px, p.height_px) for p in photos))
     for share in (_COARSE, _FINE):
@@ -169,7 +170,7 @@ def _positions(block: Block, tracks: Tracks, photos: Sequence[Photo], min_angle_
     return chosen, _posed(block, _matrices(block.quaternion), centers)
 
 
-def _place(block: Block, reference: Reference, notes: list[str]) -> Block:
+def _in_local_frame(block: Block, reference: Reference, notes: list[str]) -> Block:
     """Return the block in the local frame, if positions determine it; else with the cameras looking down."""
     index, rotations = block.image_index, _matrices(block.quaternion)
     similarity = None

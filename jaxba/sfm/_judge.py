@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxba.scene import Block, Tracks
 from jaxba.sfm._points import Triangulated, redundancy_root, triangulate_tracks
-from jaxba.sfm._settings import Settings
+from jaxba.sfm._rounds import Settings
 
 _SETTLED = 0.1  # change of the limit between rounds that is none
 _GROSS = 2.2  # times the limit

@@ -8,9 +8,8 @@ positions scatter more than they claim.
 measurement: each sigma is multiplied by the root of their number. They hold the block where positions cannot: a single
 flight line may roll about itself.
 
-**Cameras** have weak priors: what the photos tell of the focal length, the principal point in the middle within 1% of
-the width, pixels square, distortion small; and bounds. Parameters in `held` keep their value through a tight prior, not
-as fixed ones: so all rounds of an adjustment have one shape and compile once.
+**Cameras** have weak priors and bounds (`_intrinsics.py`), and square pixels. Parameters in `held` keep their value
+through a tight prior, not as fixed ones: so all rounds of an adjustment have one shape and compile once.
 
 **A block without a place on earth** is held by weak priors on all positions at its start values: the seven directions
 that photos cannot fix stay where they were, and nothing else is bent (sigma a tenth of the block's extent).
@@ -39,21 +38,15 @@ from jaxba.ba import (
 from jaxba.geometry import CAMERAS, Cauchy, GemanMcClure, Linear, Pose
 from jaxba.scene import Block, Photo, Reference
 from jaxba.sfm._control import CONTROL_LOSS, ControlPart
+from jaxba.sfm._intrinsics import NaturalIntrinsics, natural_intrinsics
 
 POSITION_LOSS = GemanMcClure(4.0)
-FOCAL_BOUNDS = (0.7, 1.4)
-BOUNDS = {"k1": 0.5, "k2": 0.5, "k3": 0.5, "k4": 0.5, "p1": 0.05, "p2": 0.05}
-_STD = {"k1": 0.2, "k2": 0.2, "k3": 0.2, "k4": 0.2, "p1": 0.01, "p2": 0.01}
-_FOCAL_STD = {"given": 0.02, "calibrated": 0.02, "focal_plane": 0.05, "sensor_table": 0.05, "equivalent_35mm": 0.07}
-_FOCAL_UNKNOWN_STD = 0.3
-_CENTER_STD, _CENTER_BOUND = 0.01, 0.1  # of the image's width
 _ASPECT_STD = 5e-4
 _HELD = 1e-6  # of a parameter's natural sigma
 _ATTITUDE_STD_RAD = 0.035  # at least: 2 degrees
 _START_ATTITUDE_STD_RAD = 0.5
 _ANCHOR = 0.1  # sigma of positions at their start values, of the block's extent
 _COLLINEAR = 0.03  # second over first extent of the positions
-_LEAST_IMAGES_ALL_FREE = 8
 
 
 def to_problem(
@@ -137,47 +130,6 @@ def with_solution(block: Block, solution: Solution) -> Block:
     )
 
 
-def free_parameters(camera_model: str, *, num_images: int) -> tuple[str, ...]:
-    """Return the parameters that a block of so many images can calibrate: focal length and k1 only in a small one."""
-    names = CAMERAS[camera_model].parameter_names()
-    if num_images >= _LEAST_IMAGES_ALL_FREE:
-        return tuple(name for name in names if not (camera_model == "OPENCV" and name == "k3"))
-    return tuple(name for name in names if name in ("f", "fx", "fy", "k1"))
-
-
-@dataclasses.dataclass(frozen=True)
-class NaturalIntrinsics:
-    """What is known of the cameras beforehand, and their bounds; a row a camera."""
-
-    center: Float[np.ndarray, "cameras parameters"]
-    std: Float[np.ndarray, "cameras parameters"]
-    lower: Float[np.ndarray, "cameras parameters"]
-    upper: Float[np.ndarray, "cameras parameters"]
-
-
-def natural_intrinsics(block: Block, photos: Sequence[Photo]) -> NaturalIntrinsics:
-    """Return priors and bounds of the cameras of a block that has not been adjusted yet."""
-    names = CAMERAS[block.camera_model].parameter_names()
-    center, std = np.zeros(block.camera_parameters.shape), np.zeros(block.camera_parameters.shape)
-    lower, upper = np.zeros(center.shape), np.zeros(center.shape)
-    for c in range(len(center)):
-        members = [photos[i] for i in block.image_index[block.camera_index == c]] or list(photos[:1])
-        width, height = members[0].width_px, members[0].height_px
-        focal, share = _focal(members)
-        for k, name in enumerate(names):
-            if name in ("f", "fx", "fy"):
-                value = block.camera_parameters[c, k] if focal is None else focal
-                low, high = (factor * value for factor in FOCAL_BOUNDS)
-                row = value, share * value, low, high
-            elif name in ("cx", "cy"):
-                value = (width if name == "cx" else height) / 2
-                row = value, _CENTER_STD * width, value - _CENTER_BOUND * width, value + _CENTER_BOUND * width
-            else:
-                row = 0.0, _STD[name], -BOUNDS[name], BOUNDS[name]
-            center[c, k], std[c, k], lower[c, k], upper[c, k] = row
-    return NaturalIntrinsics(center, std, lower, upper)
-
-
 def used_positions(block: Block, reference: Reference) -> Bool[np.ndarray, " images"]:
     """Return which of the block's images have a position that is a prior."""
     index = block.image_index
@@ -197,14 +149,6 @@ def _fix_attitude(reference: Reference, index: np.ndarray) -> bool:
     """Whether positions fix a block's rotation: they lie on no line, and their heights are measured."""
     full = index[np.isfinite(reference.std_m[index] + reference.xyz_m[index]).all(axis=1)]
     return not is_collinear(reference.xyz_m[full])
-
-
-def _focal(members: Sequence[Photo]) -> tuple[float | None, float]:
-    """Return the focal length that the photos tell, and its sigma as a share."""
-    known = [(p.focal_px, p.focal_source) for p in members if p.focal_px is not None]
-    if not known:
-        return None, _FOCAL_UNKNOWN_STD
-    return float(np.median([focal for focal, _ in known])), _FOCAL_STD[known[0][1] or "equivalent_35mm"]
 
 
 def _intrinsics_prior(

@@ -1,17 +1,53 @@
-"""Poses of images that the view graph's rotations left out, from points that other images have fixed.
+"""Images that the view graph's rotations left out, added by the points that other images have fixed.
 
 Minimal samples of three points with a consensus on all (poselib), then its refinement. Points and pixels meet through
-the tracks.
+the tracks. What one round adds fixes more points, which the next one uses.
 """
 
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxba.scene import Block, Tracks
+from jaxba.sfm._points import with_points
 from jaxba.sfm._rays import make_rays
+from jaxba.sfm._start_cameras import StartCameras
+
+MIN_INLIERS = 12  # with fewer points a wrong pose finds support by chance
+
+
+def register_more(
+    block: Block,
+    tracks: Tracks,
+    cameras: StartCameras,
+    component: Int[np.ndarray, " n"],
+    reasons: dict[int, str],
+    min_angle_rad: float,
+    max_error_px: float,
+) -> Block:
+    """Return the block with images added whose points fix their pose; `reasons` says it of the others."""
+    while True:
+        missing = np.setdiff1d(component, block.image_index)
+        found = [resect(block, tracks, int(i), int(cameras.of_image[i]), max_error_px, MIN_INLIERS) for i in missing]
+        good = [f for f in found if f.is_found]
+        for f in found:
+            if not f.is_found:
+                text = f"{f.num_inliers} of its {f.num_points} points agree on a pose, {MIN_INLIERS} are needed"
+                reasons.setdefault(f.image, text)
+        if not good:
+            return block
+        index = np.concatenate([block.image_index, [f.image for f in good]])
+        order = np.argsort(index)
+        block = dataclasses.replace(
+            block,
+            image_index=index[order],
+            quaternion=np.concatenate([block.quaternion, [f.quaternion for f in good]])[order],
+            translation_m=np.concatenate([block.translation_m, [f.translation_m for f in good]])[order],
+            camera_index=cameras.of_image[index[order]],
+        )
+        block = with_points(block, tracks, min_angle_rad=min_angle_rad, max_error_px=max_error_px)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""One round of the adjustment: the problem of a block with what was measured beside it, solved; all share one shape."""
+"""One round of the adjustment: the problem of a block with what was measured beside it, solved; all share one shape.
+
+`Settings` are those of all rounds.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,10 +23,26 @@ from jaxba.sfm._control import (
 )
 from jaxba.sfm._points import track_rows
 from jaxba.sfm._problem import to_problem, used_positions, with_solution
-from jaxba.sfm._settings import Settings
 
 _SPARE = 0.03  # room for tracks that pruning cuts in two
 _LEAST_POSITIONS = 6
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What may be set of the adjustment in rounds; see the adjust stage's parameters."""
+
+    loss: str = "huber"
+    f_scale: float = 1.0
+    max_nfev: int = 500
+    ftol: float = 1e-8
+    xtol: float = 1e-8
+    track_threshold: float = 2.0
+    mad_factor: float = 2.5
+    edge_median_limit: float = 3.0
+    min_angle_rad: float = 0.026
+    max_rounds: int = 5
+    complete_radius: float = 4.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,23 +1,47 @@
 """Sigmas of an adjusted block, from the covariance of its last solve, or why there are none.
 
-The sigmas of observations are enlarged to how far errors really scatter (see `_spread.py`), so the covariance is not
-scaled by the variance factor once more; a point's own errors count in its sigma.
+The sigmas of observations are enlarged to how far errors really scatter (`spread`), so the covariance is not scaled by
+the variance factor once more; a point's own errors count in its sigma (`with_own_errors`).
 
 Positions are known to the mean of all GNSS positions; an offset that these have in common, metres for a single
 receiver, is not in their sigmas, nor here.
+
+**All together.** The sigma that weighs an observation is that of the median. Errors of feature points have longer tails
+than a normal distribution, and all of them bear on the result. An estimate that solves `sum psi(e) = 0` has the
+variance `E psi^2 / (E psi')^2` an observation (Huber 1964): for SIFT points in simulated photos 1.8 times what the
+median says. Errors cut off by a limit look narrower than they are, so it is taken as 1 at least. What cutting itself
+costs is not in it: with normal errors, poses known and 5% or 10% cut, points scatter by 1.10 or 1.17 times their
+variance, all of it in tracks that lost an observation.
+
+**Each point.** A blurred or slanted feature is measured worse in all its images: squared errors within a track have a
+correlation of 0.3 to 0.4. The sums of squared errors of tracks tell how variances are distributed (scaled inverse
+chi-square of nu degrees of freedom and scale s^2, by the mean and the variance of their logarithms; Smyth 2004), and
+that of a track with the sum S and d = 2n - 3 is then expected to be
+
+    (nu s^2 + S) / (nu + d - 2).
+
+So a point of two images hardly speaks for itself, one of ten does.
 """
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.special import digamma, polygamma
 
 from jaxba._errors import JaxbaError
 from jaxba.ba import Covariance, covariance
-from jaxba.scene import Reference
+from jaxba.scene import Block, Reference
 from jaxba.sfm._adjust import Adjusted
+from jaxba.sfm._points import redundancy_root
 from jaxba.sfm._problem import used_positions
-from jaxba.sfm._spread import spread, with_own_errors
+from jaxba.sfm._rays import make_rays
+
+_LEAST_REDUNDANCY = 30  # to tell how errors are spread
+_LEAST_TRACKS, _LEAST_FREEDOM = 100, 3  # to tell how variances are distributed
+_FREEDOM = np.geomspace(3.0, 1000.0, 400)  # of that distribution; at the last, all tracks are alike
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +93,75 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
         )
     factor = found.variance_factor * times**2  # positions' part of the cost is small
     return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found)
+
+
+def spread(adjusted: Adjusted) -> float:
+    """Return how many times the sigma that weighed an observation accounts for the scatter of what was estimated.
+
+    With psi(e) = w(|e|) e over all observations, in sigmas, E over both coordinates:
+
+        spread^2 = E psi^2 E w / (E psi')^2,   E psi' = E (w + |e|^2 dw/d|e|^2)
+
+    `E psi^2` is over the redundancy; psi' is taken at errors as in long tracks. It is 1 at least.
+    """
+    block, error = adjusted.block, adjusted.error_px / adjusted.std_px
+    redundancy = 2 * block.num_observations - 3 * block.num_points - 6 * block.num_images
+    if redundancy < _LEAST_REDUNDANCY:
+        return 1.0
+    views = np.bincount(block.observation_point, minlength=block.num_points)
+    comparable = error * redundancy_root(views)[block.observation_point]
+    with jax.enable_x64(True):
+        _, weight, change = (np.asarray(part) for part in adjusted.loss.derivatives(jnp.asarray(comparable**2)))
+    slope = np.mean(weight + comparable**2 * change)
+    if slope <= 0:  # a loss that turns back, with most errors beyond its turn
+        return 1.0
+    squared = np.sum((weight * error) ** 2) / redundancy
+    return float(max(np.sqrt(squared * np.mean(weight)) / slope, 1.0))
+
+
+def with_own_errors(
+    variance_m2: Float[np.ndarray, "points 3"],
+    block: Block,
+    error_px: Float[np.ndarray, " observations"],
+    std_px: float,
+) -> Float[np.ndarray, "points 3"]:
+    """Return the variances of points, where the part of their own observations follows these.
+
+    - `variance_m2`: from observations that all have the sigma `std_px`.
+    """
+    own = np.minimum(own_variance(block, std_px), variance_m2)
+    return variance_m2 + (own_factors(block, error_px)[:, None] - 1) * own
+
+
+def own_variance(block: Block, std_px: float) -> Float[np.ndarray, "points 3"]:
+    """Return the variances of points that their own observations account for, poses and cameras known, in m^2."""
+    rays = make_rays(block, block.observation_image, block.observation_xy_px)
+    distance = rays.errors_px(block.points_m[block.observation_point].T)[1]
+    order = np.argsort(block.observation_point, kind="stable")
+    by_point = (rays.by_point / (distance * std_px))[..., order]
+    starts = np.searchsorted(block.observation_point[order], np.arange(block.num_points))
+    normal = np.add.reduceat(np.einsum("cin,cjn->nij", by_point, by_point), starts, axis=0)
+    normal[~np.isfinite(normal).all(axis=(1, 2))] = 0.0
+    inverse = np.linalg.pinv(normal, hermitian=True)
+    return np.maximum(np.einsum("nii->ni", inverse), 0.0)
+
+
+def own_factors(block: Block, error_px: Float[np.ndarray, " observations"]) -> Float[np.ndarray, " points"]:
+    """Return the variance of each point's observations over that of all."""
+    views = np.bincount(block.observation_point, minlength=block.num_points)
+    total = np.bincount(block.observation_point, error_px**2, minlength=block.num_points)
+    freedom = np.maximum(2 * views - 3, 1)
+    use = (freedom >= _LEAST_FREEDOM) & (total > 0)
+    if use.sum() < _LEAST_TRACKS:
+        return np.ones(block.num_points)
+    level = np.log(total[use]) - digamma(freedom[use] / 2) - np.log(2.0)
+    between = level.var() - polygamma(1, freedom[use] / 2).mean()
+    nu = _FREEDOM[np.argmin(np.abs(polygamma(1, _FREEDOM / 2) - between))]
+    if nu == _FREEDOM[-1]:
+        return np.ones(block.num_points)
+    scale = np.exp(level.mean() + digamma(nu / 2) - np.log(nu / 2))
+    variance = (nu * scale + total) / (nu + freedom - 2)
+    return variance * freedom.sum() / np.sum(variance * freedom)
 
 
 def _std(blocks: Float[np.ndarray, "n k k"]) -> Float[np.ndarray, "n k"]:

@@ -17,9 +17,9 @@ from jaxba.ba._factor import factor_reduced, solve_factored
 from jaxba.ba._hessian import hessian
 from jaxba.ba._linearise import cost, curvature
 from jaxba.ba._plan import make_plan
-from jaxba.ba._rows import Step, Unknowns
 from jaxba.ba._schur import back_substitute, eliminate_points, reduce_vector
 from jaxba.ba._system import System, initial_unknowns, make_system
+from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.geometry import AbstractLoss, Cauchy, Huber
 
 SIMPLE = EVERY_CAMERA[0]

@@ -8,7 +8,8 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._problem import AbstractPrior
-from jaxba.ba._rows import JacobianBlock, Rows, Unknowns, rows_of
+from jaxba.ba._rows import JacobianBlock, Rows, rows_of
+from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractLoss, Linear
 
 

@@ -8,7 +8,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.ba._problem import AbstractPrior
-from jaxba.ba._rows import Rows, Unknowns
+from jaxba.ba._rows import Rows
+from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractLoss, Linear
 
 

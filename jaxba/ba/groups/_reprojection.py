@@ -21,7 +21,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.ba._rows import Unknowns, rows_of
+from jaxba.ba._rows import rows_of
+from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractCamera, AbstractLoss
 
 Components = Sequence[Array]

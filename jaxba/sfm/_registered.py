@@ -1,53 +1,25 @@
-"""Which images have a pose that can be trusted: more of them, fewer of them, and the reasons for those without."""
+"""Which images stay registered: those that enough points hold, and that something ties to the rest.
+
+Two images that share points fix each other's direction, not the distance: that takes points seen in three images. A
+group of images that hangs on the rest by one pair of images looks perfect in its residuals at any size. So images are
+counted in as an incremental reconstruction adds them: from the best pair on, each image that sees enough points which
+two images within the whole have already fixed. What is not part of that whole needs a trusted position near it.
+"""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
 
 from jaxba._errors import JaxbaError
 from jaxba.scene import Block, Left, Photo, Reference, Tracks
 from jaxba.sfm._points import with_points
-from jaxba.sfm._resection import resect
-from jaxba.sfm._rigid import rigid_whole
-from jaxba.sfm._start_cameras import StartCameras
+from jaxba.sfm._resection import MIN_INLIERS
 
 CONTRADICTION = 5.0  # sigmas
 _START_STD = 0.005  # of the distance to the points: what an uncalibrated lens makes of start values
-MIN_INLIERS = 12  # with fewer points a wrong pose finds support by chance
-
-
-def register_more(
-    block: Block,
-    tracks: Tracks,
-    cameras: StartCameras,
-    component: Int[np.ndarray, " n"],
-    reasons: dict[int, str],
-    min_angle_rad: float,
-    max_error_px: float,
-) -> Block:
-    """Return the block with images added whose points fix their pose; `reasons` says it of the others."""
-    while True:
-        missing = np.setdiff1d(component, block.image_index)
-        found = [resect(block, tracks, int(i), int(cameras.of_image[i]), max_error_px, MIN_INLIERS) for i in missing]
-        good = [f for f in found if f.is_found]
-        for f in found:
-            if not f.is_found:
-                text = f"{f.num_inliers} of its {f.num_points} points agree on a pose, {MIN_INLIERS} are needed"
-                reasons.setdefault(f.image, text)
-        if not good:
-            return block
-        index = np.concatenate([block.image_index, [f.image for f in good]])
-        order = np.argsort(index)
-        block = dataclasses.replace(
-            block,
-            image_index=index[order],
-            quaternion=np.concatenate([block.quaternion, [f.quaternion for f in good]])[order],
-            translation_m=np.concatenate([block.translation_m, [f.translation_m for f in good]])[order],
-            camera_index=cameras.of_image[index[order]],
-        )
-        block = with_points(block, tracks, min_angle_rad=min_angle_rad, max_error_px=max_error_px)
 
 
 def drop_weak(
@@ -92,6 +64,47 @@ def drop_weak(
         block = with_points(block, tracks, min_angle_rad=min_angle_rad, max_error_px=max_error_px)
 
 
+def rigid_whole(
+    image: Int[np.ndarray, " observations"],
+    point: Int[np.ndarray, " observations"],
+    num_images: int,
+    *,
+    least: int,
+) -> tuple[Bool[np.ndarray, " images"], Int[np.ndarray, " images"]]:
+    """Return which images belong to the largest rigid whole, and how many of its points each image sees.
+
+    `least`: points, seen by two images of the whole or more, that an image needs.
+
+    >>> image = np.array([0, 1, 0, 1, 2, 2, 3])  # two points in 0 and 1, one of them in 2 as well, one in 2 and 3
+    >>> point = np.array([0, 0, 1, 1, 1, 2, 2])
+    >>> [part.tolist() for part in rigid_whole(image, point, 4, least=1)]
+    [[True, True, True, False], [2, 2, 1, 0]]
+    """
+    num_points = int(point.max(initial=-1)) + 1
+    sees = sparse.csr_array((np.ones(len(image)), (image, point)), shape=(num_images, num_points))
+    shared = sparse.triu(sees @ sees.T, 1).tocoo()
+    left = np.ones(num_images, bool)
+    best, best_count = np.zeros(num_images, bool), np.zeros(num_images, int)
+    while np.count_nonzero(left) > np.count_nonzero(best):
+        strength = np.where(left[shared.row] & left[shared.col], shared.data, 0)
+        if not strength.any():
+            break
+        pair = int(np.argmax(strength))
+        whole = np.zeros(num_images, bool)
+        whole[[shared.row[pair], shared.col[pair]]] = True
+        while True:
+            fixed = np.bincount(point[whole[image]], minlength=num_points) >= 2
+            count = np.bincount(image[fixed[point]], minlength=num_images)
+            grown = whole | (count >= least)
+            if np.array_equal(grown, whole):
+                break
+            whole = grown
+        if np.count_nonzero(whole) > np.count_nonzero(best):
+            best, best_count = whole, count
+        left &= ~whole
+    return best, best_count
+
+
 def contradictions(block: Block, reference: Reference, photos: Sequence[Photo]) -> list[str]:
     """Name positions that the images contradict; they stay, under a robust loss."""
     index, sigmas = block.image_index, sigmas_off(block, reference)
@@ -110,6 +123,7 @@ def contradictions(block: Block, reference: Reference, photos: Sequence[Photo]) 
 
 
 def unregistered(photos: Sequence[Photo], tracks: Tracks, block: Block, reasons: dict[int, str]) -> tuple[Left, ...]:
+    """Return the photos without a pose, and what to do about each; `reasons` are those of the largest component."""
     left = {}
     registered = set(block.image_index.tolist())
     for component in tracks.components:

@@ -9,7 +9,7 @@ from surveys import Case, make_case
 from jaxba.geometry import SimpleRadial
 from jaxba.scene import Block
 from jaxba.sfm import with_points
-from jaxba.sfm._rough import _Rows, _State, adjust_roughly
+from jaxba.sfm._rough_adjustment import _Rows, _State, adjust_roughly
 
 CAMERA = SimpleRadial(f=3650.0, cx=2736.0, cy=1824.0, k1=-0.06)
 

@@ -9,7 +9,7 @@ from simulated import Simulated, simulate, true_block
 from jaxba.scene import Block
 from jaxba.sfm import Settings, adjust
 from jaxba.sfm._points import apply_points, triangulate_tracks
-from jaxba.sfm._spread import own_factors, own_variance, spread, with_own_errors
+from jaxba.sfm._uncertainty import own_factors, own_variance, spread, with_own_errors
 
 STD_PX = 0.5
 

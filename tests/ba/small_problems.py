@@ -88,13 +88,15 @@ def small_problem(
     lever_arm: bool = False,
     num_outliers: int = 0,
     prior_loss: AbstractLoss | None = None,
+    at_truth: bool = False,
     seed: int = 0,
 ) -> Problem:
     """Return a flight along x, 3 m between images and 10 m above the points, with all five priors.
 
     Each point lies in the `seen_by` nearest images but for every sixth observation; pixels have 0.5 px of noise and
     outliers 30 px. The last image has no measured height, the last camera no calibrated last parameter and the last
-    control point no surveyed height. Cameras look down with any heading, tilted by 0.15 rad.
+    control point no surveyed height. Cameras look down with any heading, tilted by 0.15 rad. Start
+    values are some sigmas off, or the truth.
     """
     rng = np.random.default_rng(seed)
     prior_loss = Linear() if prior_loss is None else prior_loss
@@ -154,13 +156,14 @@ def small_problem(
     if lever_arm:
         priors.append(LeverArmPrior(measured_arm[None], np.full((1, 3), 0.05)))
 
-    start = Rotation.from_rotvec(0.003 * rng.normal(size=(num_images, 3))) * attitudes
-    start_centers = centers + 0.03 * rng.normal(size=centers.shape)
-    start_parameters = true_parameters + scale * rng.normal(size=true_parameters.shape)
+    off = 0.0 if at_truth else 1.0
+    start = Rotation.from_rotvec(off * 0.003 * rng.normal(size=(num_images, 3))) * attitudes
+    start_centers = centers + off * 0.03 * rng.normal(size=centers.shape)
+    start_parameters = true_parameters + off * scale * rng.normal(size=true_parameters.shape)
     problem = Problem.build(
         Pose(start.as_quat(scalar_first=True), -start.apply(start_centers)),
         type(camera)(*start_parameters.T),
-        points + 0.03 * rng.normal(size=points.shape),
+        points + off * 0.03 * rng.normal(size=points.shape),
         Observations(xy_px, rng.uniform(0.4, 0.8, len(xy_px)), image_index, point_index),
         camera_index=camera_index,
         priors=priors,

@@ -23,20 +23,29 @@ def _rms(survey: jaxba.synthetic.Survey, points: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum((np.asarray(points)[check] - survey.truth.points[check]) ** 2, axis=1))))
 
 
-def test_a_scale_learned_from_held_out_observations_is_nearer_the_truth(survey: jaxba.synthetic.Survey):
-    far = jaxba.Huber(30.0)
-    tuned = jaxba.tune(survey.problem, loss=far, hold_out=0.1, steps=8, learning_rate=0.5)
+FAR = jaxba.Huber(30.0)
+
+
+@pytest.fixture(scope="module")
+def tuned(survey: jaxba.synthetic.Survey) -> jaxba.Tuned:
+    """A scale learned from held-out observations; its problem, without them, has programs that the tests share."""
+    return jaxba.tune(survey.problem, loss=FAR, hold_out=0.1, steps=8, learning_rate=0.5)
+
+
+def test_a_scale_learned_from_held_out_observations_is_nearer_the_truth(
+    survey: jaxba.synthetic.Survey, tuned: jaxba.Tuned
+):
     assert tuned.history[-1, 0] < tuned.history[0, 0] and tuned.score == tuned.history.min()
     assert tuned.learned["loss scale"] == pytest.approx(float(tuned.loss.f_scale)) and tuned.loss.f_scale < 10.0
-    before = _rms(survey, jaxba.solve(survey.problem, loss=far).points)
-    assert _rms(survey, jaxba.solve(survey.problem, loss=tuned.loss).points) < 0.8 * before
+    before = _rms(survey, jaxba.solve(tuned.problem, loss=FAR).points)
+    assert _rms(survey, jaxba.solve(tuned.problem, loss=tuned.loss).points) < 0.8 * before
     assert tuned.problem.num_observations < survey.problem.num_observations  # the held-out data was not in the fit
 
 
-def test_several_starts_at_once_end_at_the_best(survey: jaxba.synthetic.Survey):
-    check = survey.truth.check_index
+def test_several_starts_at_once_end_at_the_best(survey: jaxba.synthetic.Survey, tuned: jaxba.Tuned):
+    check, problem = survey.truth.check_index, tuned.problem
     tuned = jaxba.tune(
-        survey.problem,
+        problem,
         loss=jaxba.Huber(5.0),
         learn=("loss scale", "position sigmas"),
         check_points=(check, survey.truth.points[check]),
@@ -45,7 +54,7 @@ def test_several_starts_at_once_end_at_the_best(survey: jaxba.synthetic.Survey):
     )
     assert tuned.history.shape == (3, 2) and tuned.score == tuned.history.min()
     assert set(tuned.learned) == {"loss scale", "position sigmas"}
-    given, learned = survey.problem.priors[0], tuned.problem.priors[0]
+    given, learned = problem.priors[0], tuned.problem.priors[0]
     np.testing.assert_allclose(learned.std_m, given.std_m * tuned.learned["position sigmas"])
 
 

@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.engine._store import load
 from jaxba.geo import geodetic_from_local, local_from_geodetic, local_from_projected
-from jaxba.geometry import CAMERAS, Pose, triangulate
+from jaxba.geometry import CAMERAS, AbstractCamera, Pose, triangulate
 from jaxba.pipeline import adjust, crs, metadata
 from jaxba.scene import Block, LocalFrame
 from jaxba.simulation._survey import survey_frame
@@ -222,15 +223,29 @@ def _targets(
     return [Figure(name, "m", np.array(errors), np.array(stds))]
 
 
+@eqx.filter_jit
+def _meeting_point(
+    camera: AbstractCamera,
+    quaternion: Float[np.ndarray, "marks 4"],
+    translation_m: Float[np.ndarray, "marks 3"],
+    xy_px: Float[np.ndarray, "marks 2"],
+    weight: Float[np.ndarray, " marks"],
+) -> Float[jax.Array, "3"]:
+    return triangulate(Pose(quaternion, translation_m), camera.unproject(xy_px), weight=weight).point
+
+
 def _triangulated(
     block: Block, image: Int[np.ndarray, " marks"], xy_px: Float[np.ndarray, "marks 2"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Return the point of marks, and its sigmas that the marks alone account for."""
     rotation = Rotation.from_quat(block.quaternion[image], scalar_first=True).as_matrix()
+    # rows of weight zero make all targets of one shape, which is compiled once
+    padding = block.num_images - len(image)
+    rows, xy = np.pad(image, (0, padding)), np.pad(xy_px, ((0, padding), (0, 0)), mode="edge")
+    weight = np.pad(np.ones(len(image)), (0, padding))
     with jax.enable_x64(True):
         camera = CAMERAS[block.camera_model].from_parameters(jnp.asarray(block.camera_parameters[0]))
-        poses = Pose(jnp.asarray(block.quaternion[image]), jnp.asarray(block.translation_m[image]))
-        point = np.asarray(triangulate(poses, camera.unproject(jnp.asarray(xy_px))).point)
+        point = np.asarray(_meeting_point(camera, block.quaternion[rows], block.translation_m[rows], xy, weight))
     distance = np.linalg.norm(point - block.centers_m[image], axis=1)
     axis = (point - block.centers_m[image]) / distance[:, None]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]

@@ -42,9 +42,10 @@ class Survey:
         geotags: Path | None = None,
         gcp: Path | None = None,
         check: Path | None = None,
-        workers: int = 2,
+        workers: int = 1,
         tell: Callable[[Event], None] = lambda event: None,
     ) -> Run:
+        """Run as far as told; one worker does, since the session's processes keep the cores busy among them."""
         settings = changed(PIPELINE.settings, [*FAST, f"workers.workers={workers}", *changes])
         return run_pipeline(
             self.photos, self.project, settings, until=until, geotags=geotags, gcp=gcp, check=check, tell=tell
@@ -86,7 +87,7 @@ def make_photos(place: Path) -> None:
 def make_project(photos: Path) -> Callable[[Path], None]:
     def make(place: Path) -> None:
         begun = time.perf_counter()
-        Survey(photos, place / "project").run()
+        Survey(photos, place / "project").run(workers=2)
         (place / "seconds").write_text(f"{time.perf_counter() - begun:.1f}")
 
     return make

@@ -1,35 +1,26 @@
 """One whole run on a simulated survey agrees with the truth that it has not seen, within its own predicted sigmas.
 
-The limits are those of `python -m benchmarks.truth` on larger surveys, where they hold for several seeds.
+The run is the one that the tests share; the limits are those of `python -m benchmarks.truth` on larger surveys, where
+they hold for several seeds.
 """
-
-from pathlib import Path
 
 import numpy as np
 import pytest
+from small_survey import NUM_PHOTOS, Survey
 
 from benchmarks.truth import Figure, compare, markdown
-from jaxba.engine import changed
-from jaxba.pipeline import PIPELINE, run_pipeline
-from jaxba.simulation.photos import Params, write_survey
-
-pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
-    folder: Path = tmp_path_factory.mktemp("truth")
-    write_survey(folder / "survey", Params(num_images=12, num_oblique=3, width_px=800, seed=3))
-    settings = changed(PIPELINE.settings, ["features.nfeatures=3000", "crs.target_crs=EPSG:32615", "workers.workers=1"])
-    run_pipeline(folder / "survey" / "photos", folder / "project", settings)
-    found = compare(folder / "survey", folder / "project")
+def figures(made: Survey) -> dict[str, Figure]:
+    found = compare(made.photos.parent, made.project)
     print(markdown(found))
     return {figure.name: figure for figure in found}
 
 
 def test_positions_and_points_lie_within_three_sigma(figures: dict[str, Figure]) -> None:
     position, point = figures["positions"], figures["points"]
-    assert position.error.shape == (12, 3) and np.abs(position.over_sigma).max() < 3
+    assert position.error.shape == (NUM_PHOTOS, 3) and np.abs(position.over_sigma).max() < 3
     assert position.rms < 0.06  # of GNSS with 3 and 5 cm
     assert point.error.size > 2000 and point.share_within > 0.985 and point.rms_over_sigma < 1.5
     assert abs(np.median(point.error)) < 0.05

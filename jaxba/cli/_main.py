@@ -14,9 +14,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.cli._options import LossName, SolveOptions, WorkerOptions
-
-BAD_INPUT, INTERRUPTED = 2, 130
+from jaxba.cli._options import BAD_INPUT, INTERRUPTED, LossName, SolveOptions, WorkerOptions
 
 _EXIT_CODES = "Exit codes: 0 converged, 1 not converged (written all the same), 2 bad input or options, 130 Ctrl-C."
 
@@ -179,9 +177,9 @@ def status(
     set_: _Set = (),
     json: _Json = False,
 ) -> int:
-    from jaxba.cli._status import run
+    from jaxba.cli._project import tell_status
 
-    return run(project, config=config, changes=set_, as_json=json)
+    return tell_status(project, config=config, changes=set_, as_json=json)
 
 
 @app.command(
@@ -196,9 +194,9 @@ def verify(
     set_: _Set = (),
     json: _Json = False,
 ) -> int:
-    from jaxba.cli._verify import run
+    from jaxba.cli._project import tell_checks
 
-    return run(project, config=config, changes=set_, as_json=json)
+    return tell_checks(project, config=config, changes=set_, as_json=json)
 
 
 @app.command(
@@ -211,9 +209,9 @@ def diagnose(
     *,
     json: _Json = False,
 ) -> int:
-    from jaxba.cli._diagnose import run
+    from jaxba.cli._project import tell_diagnoses
 
-    return run(project, as_json=json)
+    return tell_diagnoses(project, as_json=json)
 
 
 @app.command(help="Print a jaxba.toml with every parameter: its default, range and one line of meaning.")
@@ -224,9 +222,9 @@ def config(
     explain: Annotated[bool, Parameter(negative="", show_default=False, help="A row a parameter instead.")] = False,
     json: _Json = False,
 ) -> int:
-    from jaxba.cli._config import run
+    from jaxba.cli._settings import tell_settings
 
-    return run(file, explain=explain, as_json=json)
+    return tell_settings(file, explain=explain, as_json=json)
 
 
 @app.command(help="Write a small simulated survey: photos with tags, control points, the truth beside them.")
@@ -249,9 +247,9 @@ def simulate(
     mark_std: Annotated[float, Parameter(help="Noise of the marks in the lists, px.")] = 0.3,
     seed: Annotated[int, Parameter(help="The same seed gives the same survey.")] = 0,
 ) -> int:
-    from jaxba.cli._simulate import run
+    from jaxba.cli._surveys import simulate as write
 
-    return run(
+    return write(
         out,
         images=images,
         oblique=oblique,
@@ -284,9 +282,9 @@ def synthetic(
         bool, Parameter(negative="--no-gnss", help="Measured positions; without, the gauge is free.")
     ] = True,
 ) -> int:
-    from jaxba.cli._synthetic import run
+    from jaxba.cli._surveys import synthetic as write
 
-    return run(
+    return write(
         out,
         num_images=images,
         seed=seed,

@@ -1,10 +1,12 @@
-"""Options of `solve`, as the command line takes them, with the defaults of `jaxba.solve`; and those of workers."""
+"""Options of `solve`, as the command line takes them, with the defaults of `jaxba.solve`; of workers; exit codes."""
 
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
+
+NOT_CONVERGED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 
 LossName = Literal["linear", "soft_l1", "huber", "cauchy", "arctan", "tukey", "geman_mcclure", "barron"]
 

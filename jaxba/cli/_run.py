@@ -10,10 +10,9 @@ from typing import Any
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.cli._config import configured
-from jaxba.cli._main import BAD_INPUT, INTERRUPTED
-from jaxba.cli._options import WorkerOptions
+from jaxba.cli._options import BAD_INPUT, INTERRUPTED, WorkerOptions
 from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Progress, StageLines, steps_told
+from jaxba.cli._settings import configured
 from jaxba.cli._text import first_of, many, to_json, wrapped
 from jaxba.engine import changed
 from jaxba.engine._compile_cache import use_compilation_cache

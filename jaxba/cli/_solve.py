@@ -13,7 +13,7 @@ import numpy as np
 from jaxba._errors import JaxbaError
 from jaxba.ba import HistoryStep, Problem, Rejected, solve_and_reject
 from jaxba.cli import _progress
-from jaxba.cli._options import SolveOptions
+from jaxba.cli._options import INTERRUPTED, NOT_CONVERGED, SolveOptions
 from jaxba.cli._result import Run, facts, summary
 from jaxba.cli._text import to_json
 from jaxba.engine._compile_cache import use_compilation_cache
@@ -27,7 +27,6 @@ from jaxba.io import (
     write_tile,
 )
 
-NOT_CONVERGED, INTERRUPTED = 1, 130
 _ROUNDS = 2
 _FILE_ENDINGS = (".bz2", ".txt", ".npz")
 _BAL_ENDINGS = (".txt", ".txt.bz2")

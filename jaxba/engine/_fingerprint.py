@@ -12,6 +12,7 @@ import enum
 import functools
 import hashlib
 import importlib.util
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -74,18 +75,47 @@ def code_version(module: str) -> str:
 
     The module's functions `lines` and `facts` do not count, nor what is imported for them alone.
     """
+    return fingerprint(_reached(module)[0])
+
+
+def packages(module: str) -> frozenset[str]:
+    """Return the packages beside jaxba and Python's own that the same code imports.
+
+    >>> sorted(packages("jaxba.vision._decode"))
+    ['PIL', 'cv2', 'jaxtyping', 'numpy']
+    """
+    return frozenset(name.partition(".")[0] for name in _reached(module)[1]) - sys.stdlib_module_names
+
+
+@functools.cache
+def _reached(module: str) -> tuple[dict[str, bytes], set[str]]:
+    """Return the sources of jaxba that a stage's module reaches, by name, and the names of the other modules.
+
+    Behind a package that is imported whole, as in `from jaxba import io`, all of its names are reached.
+    """
     path = _source(module)
     assert path is not None
     source, waiting = _without_words(path.read_bytes())
-    sources = {module: source}
+    sources, others = {module: source}, set()
     while waiting:
         name = waiting.pop()
         path = _source(name)
-        if name in sources or path is None:
-            continue
-        sources[name] = path.read_bytes()
-        waiting.extend(_imports(sources[name]))
-    return fingerprint(sources)
+        if path is None:
+            others.add(name)
+        elif name not in sources:
+            sources[name] = path.read_bytes()
+            waiting.extend(_imports(sources[name]))
+            stub = path.with_suffix(".pyi")
+            if stub.is_file():
+                waiting.extend(_behind(name, stub))
+    return sources, others
+
+
+def _behind(package: str, stub: Path) -> Iterator[str]:
+    """Yield the modules that the names of a package come from, which loads them when they are first used."""
+    for node in ast.parse(stub.read_bytes()).body:
+        if isinstance(node, ast.ImportFrom):
+            yield from ([f"{package}.{node.module}"] if node.module else [f"{package}.{a.name}" for a in node.names])
 
 
 _OF_WORDS = ("lines", "facts")
@@ -135,8 +165,10 @@ def _imported(tree: ast.Module) -> Iterator[str]:
     for node in _statements(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("jaxba"):
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] == "jaxba":
             yield from (_home(node.module, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:

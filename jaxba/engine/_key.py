@@ -2,11 +2,12 @@
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from jaxba.engine._fingerprint import code_version, fingerprint
+from jaxba.engine._fingerprint import code_version, fingerprint, packages
 from jaxba.engine._parameters import Parameters, stage_name
+from jaxba.engine._versions import versions_of
 
 _NAMED = 3
 
@@ -16,17 +17,19 @@ class Key:
     """What a result was made from: equal keys, equal results.
 
     - `code`: fingerprint of the stage's source and all that it imports of jaxba. `params`: values by name.
-    - `inputs`: fingerprint of each input by name.
+    - `inputs`: fingerprint of each input by name. `versions`: of the packages that compute in the stage.
     """
 
     code: str
     params: Mapping[str, Any]
     inputs: Mapping[str, str]
+    versions: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
     def of(module: str, params: Parameters, inputs: Mapping[str, Any]) -> "Key":
         """Return the key of a stage's module for these parameters and inputs."""
-        return Key(code_version(module), asdict(params), {name: fingerprint(value) for name, value in inputs.items()})
+        prints = {name: fingerprint(value) for name, value in inputs.items()}
+        return Key(code_version(module), asdict(params), prints, versions_of(packages(module)))
 
 
 def by_field(inputs: Any) -> dict[str, Any]:
@@ -45,6 +48,10 @@ def what_changed(before: Key, now: Key, params: Parameters) -> str:
     stage, reasons = stage_name(type(params)), []
     if before.code != now.code:
         reasons.append("jaxba's code changed")
+    for name in sorted({*before.versions, *now.versions}):
+        was, version = before.versions.get(name, "not there"), now.versions.get(name, "not there")
+        if was != version:
+            reasons.append(f"{name} was {was} and is {version}")
     for name, value in now.params.items():
         if name not in before.params:
             reasons.append(f"{stage}.{name} is new")

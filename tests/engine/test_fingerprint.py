@@ -1,17 +1,26 @@
 import dataclasses
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaxba.engine import _fingerprint
-from jaxba.engine._fingerprint import _imports, code_version, fingerprint
+from jaxba.engine import _fingerprint, _versions
+from jaxba.engine._fingerprint import _imports, code_version, fingerprint, packages
+from jaxba.engine._key import Key, what_changed
+from jaxba.pipeline import NAMES, STAGES, match
 
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
     a: object
     b: object
+
+
+def forget() -> None:
+    """Forget what was read of sources."""
+    for function in (code_version, _fingerprint._reached, _fingerprint._imports):
+        function.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -71,9 +80,9 @@ def test_code_version_changes_with_what_is_imported(monkeypatch, tmp_path):
     real = _fingerprint._source.__wrapped__
     source = {"jaxba.geometry._rotation": changed}
     monkeypatch.setattr(_fingerprint, "_source", lambda name: source.get(name) or real(name))
-    code_version.cache_clear()
+    forget()
     after = {name: code_version(name) for name in before}
-    code_version.cache_clear()
+    forget()
     assert after["jaxba.pipeline.features"] == before["jaxba.pipeline.features"]
     assert after["jaxba.ba._solve"] != before["jaxba.ba._solve"]
 
@@ -89,10 +98,10 @@ def with_change(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         changed = tmp_path / "changed.py"
         changed.write_text(original.read_text().replace(before, after))
         monkeypatch.setattr(_fingerprint, "_source", lambda name: changed if name == module else real(name))
-        code_version.cache_clear()
+        forget()
         found = code_version(stage)
         monkeypatch.undo()
-        code_version.cache_clear()
+        forget()
         return found
 
     return version
@@ -117,9 +126,34 @@ def test_other_words_rerun_nothing(with_change, module: str, before: str, after:
     [
         ("adjust", "jaxba.pipeline.adjust", "sigmas = controlled.sigmas", "sigmas = sigmas"),
         ("adjust", "jaxba.sfm._findings", "_OUTLIER = 3.0", "_OUTLIER = 4.0"),
+        ("export", "jaxba.io._las", "def write_las(", "def write_laz("),  # of a package that is imported whole
         ("export", "jaxba.report._picture", "MOST_POINTS = 200_000", "MOST_POINTS = 100_000"),  # is a file of its own
     ],
 )
 def test_what_is_made_otherwise_is_made_anew(with_change, stage: str, module: str, before: str, after: str):
     stage = f"jaxba.pipeline.{stage}"
     assert with_change(stage, module, before, after) != code_version(stage)
+
+
+def test_every_package_that_a_stage_imports_counts_or_computes_nothing():
+    found = {package for stage in NAMES for package in packages(f"jaxba.pipeline.{stage}")}
+    assert found - set(_versions._COMPUTE) == _versions.COMPUTE_NOTHING & found
+    assert {"cv2", "numpy"} <= packages("jaxba.pipeline.features") and "jax" not in packages("jaxba.pipeline.features")
+    assert {"poselib", "cv2"} <= packages("jaxba.pipeline.match")
+    assert {"jax", "optimistix", "scipy"} <= packages("jaxba.pipeline.adjust")
+    assert "cv2" not in packages("jaxba.pipeline.tracks")
+
+
+def test_another_version_makes_what_it_computed_stale_and_nothing_else(monkeypatch: pytest.MonkeyPatch):
+    def keys() -> dict[str, Key]:
+        return {stage.name: Key.of(stage.module.__name__, stage.module.Params(), {}) for stage in STAGES}
+
+    before, real = keys(), _versions._version
+    monkeypatch.setattr(_versions, "_version", lambda name: "9.9" if name == "poselib" else real(name))
+    after = keys()
+    changed = {name for name in before if before[name] != after[name]}
+    assert "match" in changed and not changed & {"metadata", "crs", "control", "pairs", "features", "tracks"}
+    params = match.Params()
+    assert what_changed(before["match"], after["match"], params) == f"poselib was {version('poselib')} and is 9.9"
+    older = dataclasses.replace(before["match"], versions={})  # as earlier versions of jaxba recorded
+    assert f"numpy was not there and is {version('numpy')}" in what_changed(older, before["match"], params)

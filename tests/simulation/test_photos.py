@@ -12,7 +12,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
-from jaxba.cli._simulate import run
+from jaxba.cli._surveys import simulate as run
 from jaxba.scene import Photo, PhotoFile, cam_from_enu
 from jaxba.simulation.photos import Params, simulate, write_survey
 from jaxba.vision._photo import read_photo

@@ -11,7 +11,7 @@ FILE = Path("jaxba.toml")
 _NAME_WIDTH = 30
 
 
-def run(file: Path | None, *, explain: bool, as_json: bool) -> int:
+def tell_settings(file: Path | None, *, explain: bool, as_json: bool) -> int:
     """Print the settings of a file, or the defaults, as a jaxba.toml; with `explain` a row a parameter."""
     settings = configured(file, quiet=True)
     if as_json:

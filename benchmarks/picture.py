@@ -1,6 +1,6 @@
 """The picture of benchmarks/README.md: `python -m benchmarks.picture` writes benchmarks/results/block.png.
 
-Left, a block of 100 photos with 2% wrong matches, adjusted with Huber's loss: the errors of the adjusted camera
+LeftOut, a block of 100 photos with 2% wrong matches, adjusted with Huber's loss: the errors of the adjusted camera
 positions against the truth, and the ellipses that the adjustment predicts for them (95%). Right, how the cost falls
 with time beside Ceres, from the results that `python -m benchmarks.run` has stored.
 """

@@ -87,7 +87,7 @@ def make_photos(place: Path) -> None:
 def make_project(photos: Path) -> Callable[[Path], None]:
     def make(place: Path) -> None:
         begun = time.perf_counter()
-        Survey(photos, place / "project").run(workers=2)
+        Survey(photos, place / "project").run()
         (place / "seconds").write_text(f"{time.perf_counter() - begun:.1f}")
 
     return make

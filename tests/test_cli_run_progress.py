@@ -11,7 +11,7 @@ import pytest
 from jaxba.cli import _run_progress as progress
 from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Pace, duration, steps_told
 from jaxba.pipeline import Event
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 
 class Clock:
@@ -25,7 +25,7 @@ class Clock:
 
 
 def photo(done: int, total: int, *, share: float | None = None, failed: str | None = None) -> Event:
-    left = () if failed is None else (Left(name=failed, reason="cut short"),)
+    left = () if failed is None else (LeftOut(name=failed, reason="cut short"),)
     return Event("photo", "features", done, total, left_out=left, share=done / total if share is None else share)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._workers import Resources, bytes_of
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 _SHOWN = 3
 
@@ -29,7 +29,7 @@ def check_room(store: Path, need: float, resources: Resources, *, what: str, eac
         )
 
 
-def check_failures(stage: str, failed: Sequence[Left], total: int, resources: Resources) -> None:
+def check_failures(stage: str, failed: Sequence[LeftOut], total: int, resources: Resources) -> None:
     """Raise `JaxbaError` where more of a stage's photos failed than may."""
     if len(failed) <= resources.num_may_fail(total):
         return
@@ -40,7 +40,7 @@ def check_failures(stage: str, failed: Sequence[Left], total: int, resources: Re
     )
 
 
-def _reasons(failed: Sequence[Left]) -> str:
+def _reasons(failed: Sequence[LeftOut]) -> str:
     """Return the commonest reasons, each with the photos that it concerns."""
     names: dict[str, list[str]] = {}
     for left in failed:

@@ -13,7 +13,7 @@ from typing import Any
 
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._workers import Resources
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class Stage:
     module: ModuleType
     inputs: Callable[[Any], Any]
     collect: Callable[[Any, dict[int, Path], dict[int, str]], Any] | None = None
-    left_out: Callable[[Any], tuple[Left, ...]] = lambda done: ()
-    useless: Callable[[Any, Any], tuple[Left, ...]] = lambda done, outputs: ()
+    left_out: Callable[[Any], tuple[LeftOut, ...]] = lambda done: ()
+    useless: Callable[[Any, Any], tuple[LeftOut, ...]] = lambda done, outputs: ()
     refuse: Callable[[Path, Sequence[Any], Any, Resources], None] = lambda folder, items, params, resources: None
     writes_files: bool = False
     reads_places: bool = False
@@ -81,12 +81,12 @@ class Pipeline:
         return next(stage for stage in self.stages if stage.name == name)
 
 
-def left_out(stages: Sequence[Stage], done: Any) -> dict[str, tuple[Left, ...]]:
+def left_out(stages: Sequence[Stage], done: Any) -> dict[str, tuple[LeftOut, ...]]:
     """Return the files that are not in the result, and photos that could not be matched, by stage.
 
     Each is named once, with the first stage that could not use it.
     """
-    result: dict[str, tuple[Left, ...]] = {}
+    result: dict[str, tuple[LeftOut, ...]] = {}
     named: set[str] = set()
     for stage in stages:
         entries = () if getattr(done, stage.name) is None else stage.left_out(done)

@@ -16,7 +16,7 @@ from jaxba.engine._key import Key, by_field, what_changed
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._project import Project
 from jaxba.engine._stage import Stage
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def why_to_do(project: Project, stage: Stage, work: Work, params: Parameters) ->
     return None
 
 
-def collected(stage: Stage, done: Any, items: Sequence[Work]) -> tuple[Any, tuple[Left, ...]]:
+def collected(stage: Stage, done: Any, items: Sequence[Work]) -> tuple[Any, tuple[LeftOut, ...]]:
     """Return what a stage made, all of whose works have been done, and the photos that it could make nothing of."""
     if stage.collect is None:
         return _store.load(items[0].folder, stage.module.Outputs), ()
@@ -91,10 +91,10 @@ def collected(stage: Stage, done: Any, items: Sequence[Work]) -> tuple[Any, tupl
     return stage.collect(done, folders, digests), failures(items)
 
 
-def failures(items: Sequence[Work]) -> tuple[Left, ...]:
+def failures(items: Sequence[Work]) -> tuple[LeftOut, ...]:
     """Return the photos of which it is recorded that nothing can be made, and why."""
     reasons = {item.photo: record.failed for item in items if (record := item.record) is not None}
-    return tuple(Left(name=name, reason=without_path(name, why)) for name, why in reasons.items() if name and why)
+    return tuple(LeftOut(name=name, reason=without_path(name, why)) for name, why in reasons.items() if name and why)
 
 
 def without_path(name: str, reason: str) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.geo._positions import Measured
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 MIN_FRAMES_FOR_DRIFT = 12
 EXPLAINED_BY_TIME = 0.5
@@ -56,7 +56,7 @@ class Judgement:
 
     is_used: Bool[np.ndarray, " photos"]
     height_above_ground_m: Float[np.ndarray, " photos"]
-    review: tuple[Left, ...]
+    review: tuple[LeftOut, ...]
     drift: HeightDrift | None
     counts: dict[str, int]
     notes: tuple[str, ...]
@@ -104,7 +104,7 @@ def judge_positions(
             f"{counts['altitude']} of {known} positions are off the median flight height: a flight at several heights, "
             "or over steep ground? If so raise crs.altitude_variance, so that they are used."
         )
-    review = tuple(Left(name=name, reason=text) for name, text in zip(measured.names, reasons, strict=True) if text)
+    review = tuple(LeftOut(name=name, reason=text) for name, text in zip(measured.names, reasons, strict=True) if text)
     relative = measured.relative_altitude_m
     is_above = relative >= MIN_FLIGHT_HEIGHT_M
     return Judgement(

@@ -17,7 +17,7 @@ from jaxba.pipeline.metadata import Outputs as Described
 from jaxba.pipeline.pairs import Outputs as Paired
 from jaxba.pipeline.start import Outputs as Started
 from jaxba.pipeline.tracks import Outputs as Tracked
-from jaxba.scene import Left, Photo, PhotoFile, Reference
+from jaxba.scene import LeftOut, Photo, PhotoFile, Reference
 
 T = TypeVar("T")
 
@@ -40,9 +40,9 @@ class Done:
     control: Controlled | None = None
     pairs: Paired | None = None
     features: Detected | None = None
-    features_left_out: tuple[Left, ...] = ()
+    features_left_out: tuple[LeftOut, ...] = ()
     match: Matched | None = None
-    match_left_out: tuple[Left, ...] = ()
+    match_left_out: tuple[LeftOut, ...] = ()
     tracks: Tracked | None = None
     start: Started | None = None
     adjust: Adjusted | None = None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from jaxba.pipeline._done import Done
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Event:
     done: int = 0
     total: int = 0
     seconds: float = 0.0
-    left_out: tuple[Left, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
     share: float = 0.0
     lines: tuple[str, ...] = ()
     by_photos: bool = False

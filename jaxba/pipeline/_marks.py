@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
 from jaxba.io import Mark, SurveyedPoint, photo_finder
-from jaxba.scene import Left, Photo
+from jaxba.scene import LeftOut, Photo
 
 _OUTSIDE = 0.1  # of all marks: more of them outside are no single mistakes
 _SAME_FORMAT = 0.02  # the format, width over height, of a photo that was only scaled
@@ -28,7 +28,7 @@ class PhotoMarks:
     point: Int[np.ndarray, " marks"]
     image: Int[np.ndarray, " marks"]
     xy_px: Float[np.ndarray, "marks 2"]
-    left_out: tuple[Left, ...]
+    left_out: tuple[LeftOut, ...]
     notes: tuple[str, ...]
 
 
@@ -69,7 +69,7 @@ def marks_in_photos(
             "list away."
         )
     left = [
-        Left(name=photo, reason=f"is marked ({', '.join(names)}), but is none of the photos that can be used")
+        LeftOut(name=photo, reason=f"is marked ({', '.join(names)}), but is none of the photos that can be used")
         for photo, names in unknown.items()
     ]
     xy_px = np.array([[mark.x_px, mark.y_px] for mark in marks])
@@ -79,7 +79,7 @@ def marks_in_photos(
     for k in np.flatnonzero(outside):
         photo = photos[image[k]]
         left.append(
-            Left(
+            LeftOut(
                 name=f"{points[point[k]].name} in {photo.name}",
                 reason=f"the mark {marks[k].x_px:g} {marks[k].y_px:g} ({marks[k].source}) lies outside the photo of "
                 f"{photo.width_px} x {photo.height_px} pixels",

@@ -29,7 +29,7 @@ from jaxba.pipeline._done import Done
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._stages import NAMES, STAGES
 from jaxba.report import summary, told_of
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 
 def run_pipeline(
@@ -72,7 +72,7 @@ def _run_stages(project: Project, given: Given, done: Done, until: str | None, t
     stages_run: list[str] = []
     lines: dict[str, list[str]] = {}
 
-    def end(stopped: Left | None = None) -> Run:
+    def end(stopped: LeftOut | None = None) -> Run:
         """Write the summary, and that the run has ended."""
         facts = summary(STAGES, done, stages_run=stages_run, lines=lines, stopped=stopped)
         project.write_json(SUMMARY, facts)
@@ -88,7 +88,7 @@ def _run_stages(project: Project, given: Given, done: Done, until: str | None, t
         except (JaxbaError, KeyboardInterrupt) as error:
             reason = str(error) or "interrupted"
             with contextlib.suppress(JaxbaError):  # what stopped the run is the news
-                end(Left(name=stage.name, reason=reason))
+                end(LeftOut(name=stage.name, reason=reason))
             raise
         setattr(done, stage.name, outputs)
         if stage.is_by_photo:
@@ -112,7 +112,7 @@ def _run_stage(
     params: Parameters,
     resources: Resources,
     tell: Callable[[Event], None],
-) -> tuple[Any, int, tuple[Left, ...], tuple[str, ...]]:
+) -> tuple[Any, int, tuple[LeftOut, ...], tuple[str, ...]]:
     """Return what a stage made, how much of it had to be done, the photos that it could not work on, and notes."""
     items = works(project, stage, done, params)
     waiting = [item for item in items if why_to_do(project, stage, item, params)]
@@ -150,13 +150,13 @@ def _run_photos(
     params: Parameters,
     resources: Resources,
     tell: Callable[[Event], None],
-) -> tuple[list[Left], tuple[str, ...]]:
+) -> tuple[list[LeftOut], tuple[str, ...]]:
     """Run a stage for its photos that wait, in workers; return those that failed, with the reason, and notes."""
     if not waiting:
         return [], ()
     module, todo = stage.module.__name__, {id(work) for work in waiting}
     before = failures([work for work in items if id(work) not in todo])
-    failed: list[Left] = []
+    failed: list[LeftOut] = []
     queue = [
         Item(
             name=str(work.photo),
@@ -170,7 +170,7 @@ def _run_photos(
     with contextlib.closing(work_on(run_one, queue, resources)) as ending:
         for count, (item, recorded, reason) in enumerate(ending, 1):
             left = tuple(
-                Left(name=item.name, reason=without_path(item.name, why)) for why in (recorded or reason,) if why
+                LeftOut(name=item.name, reason=without_path(item.name, why)) for why in (recorded or reason,) if why
             )
             failed += left
             effort_done += item.effort

@@ -20,7 +20,7 @@ from jaxba.pipeline import adjust, control, crs, export, features, match, metada
 from jaxba.pipeline._done import Done, made
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
 from jaxba.pipeline._settings import sections
-from jaxba.scene import Left, PairRecord, Reference, ViewGraph
+from jaxba.scene import LeftOut, PairRecord, Reference, ViewGraph
 
 
 def _metadata(done: Done) -> metadata.Inputs:
@@ -73,15 +73,15 @@ def _features_fit(folder: Path, items: Sequence[Work], params: features.Params, 
     features.check_store(folder, len(items), items[0].inputs.detector, params, resources)
 
 
-def _features_left_out(done: Done) -> tuple[Left, ...]:
+def _features_left_out(done: Done) -> tuple[LeftOut, ...]:
     found = () if done.match is None else done.match.fallback
     matched = {done.photos[entry.image].name for entry in found}  # SIFT found some after all
     return tuple(entry for entry in done.features_left_out if entry.name not in matched)
 
 
-def _without_keypoints(done: Done, found: features.Detected) -> tuple[Left, ...]:
+def _without_keypoints(done: Done, found: features.Detected) -> tuple[LeftOut, ...]:
     empty = {index: entry for index in sorted(found) if (entry := found[index]).num_keypoints == 0}
-    return tuple(Left(name=done.photos[i].name, reason="; ".join(f.notes) + ".") for i, f in empty.items())
+    return tuple(LeftOut(name=done.photos[i].name, reason="; ".join(f.notes) + ".") for i, f in empty.items())
 
 
 def _partners(done: Done, image: int) -> np.ndarray:

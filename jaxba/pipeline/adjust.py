@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._words import many
 from jaxba.report import Told, control_facts, grouped, sentences
-from jaxba.scene import Block, Control, ControlFit, Features, Finding, Left, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Control, ControlFit, Features, Finding, LeftOut, Photo, Reference, Tracks, ViewGraph
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +91,7 @@ class Outputs:
     std_px: float
     position_scale: Float[np.ndarray, "3"]
     findings: tuple[Finding, ...] = ()
-    pruned: tuple[Left, ...] = ()
+    pruned: tuple[LeftOut, ...] = ()
     solver: str = ""
     gnss_offset_m: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     control: ControlFit = field(default_factory=ControlFit.nothing)

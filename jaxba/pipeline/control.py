@@ -20,7 +20,7 @@ from jaxba.engine._parameters import Parameters, parameter
 from jaxba.io import ControlList, SurveyedPoint, parse_control
 from jaxba.pipeline._marks import marks_in_photos
 from jaxba.report import Told, control_facts, control_lines, reference_facts
-from jaxba.scene import Control, Left, LocalFrame, Photo, Reference
+from jaxba.scene import Control, LeftOut, LocalFrame, Photo, Reference
 
 _PLACE = ("crs", "x", "y", "z_m")
 _LEAST_FIT = {"helmert": 3, "affine": 4}  # control points that are marked twice
@@ -78,7 +78,7 @@ class Outputs:
 
     reference: Reference
     control: Control
-    left_out: tuple[Left, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -297,11 +297,11 @@ def _refuse_far(
     )
 
 
-def _weak(control: Control) -> list[Left]:
+def _weak(control: Control) -> list[LeftOut]:
     """Return the points that too few photos show."""
     count = np.bincount(control.mark_point, minlength=control.num_points)
     return [
-        Left(name=control.names[k], reason=f"is marked in {count[k]} of the photos; two or more fix a point")
+        LeftOut(name=control.names[k], reason=f"is marked in {count[k]} of the photos; two or more fix a point")
         for k in np.flatnonzero(count < 2)
     ]
 

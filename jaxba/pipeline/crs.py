@@ -8,7 +8,7 @@ import numpy as np
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.report import Told, grouped, reference_facts
-from jaxba.scene import Left, Photo, Reference
+from jaxba.scene import LeftOut, Photo, Reference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +134,7 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
     return reference_facts(outputs.reference)
 
 
-def _stop_if_too_few(is_used: np.ndarray, counts: dict[str, int], review: tuple[Left, ...], params: Params) -> None:
+def _stop_if_too_few(is_used: np.ndarray, counts: dict[str, int], review: tuple[LeftOut, ...], params: Params) -> None:
     if is_used.sum() >= params.min_positions:
         return
     if len(is_used) == 1:
@@ -169,6 +169,8 @@ def _without_positions(photos: tuple[Photo, ...], params: Params) -> Reference:
         attitude_std_rad=np.full((count, 3), np.nan),
         is_used=np.zeros(count, bool),
         height_above_ground_m=nan,
-        review=tuple(Left(name=p.name, reason="has no position in its tags or list; it is adjusted") for p in photos),
+        review=tuple(
+            LeftOut(name=p.name, reason="has no position in its tags or list; it is adjusted") for p in photos
+        ),
         notes=tuple(notes),
     )

@@ -15,7 +15,7 @@ from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._store import Stored
 from jaxba.pipeline._routing import Routing
 from jaxba.report import Told, grouped, with_ranges
-from jaxba.scene import Features, Left, Photo
+from jaxba.scene import Features, LeftOut, Photo
 from jaxba.vision import (
     CONDITIONS,
     OrbOptions,
@@ -184,7 +184,7 @@ def lines(outputs: Detected, told: Told) -> list[str]:
     first = f"{sum(counts):,} keypoints, median {int(np.median(counts)):,} an image" if counts else "no keypoints"
     used = [i for i, features in found.items() if features.num_keypoints]
     texts = [(i, text) for i in used for text in (*outputs.tunings[i].reasons, *found[i].notes)]
-    odd = [Left(name=told.photos[i], reason=text) for i, text in texts]
+    odd = [LeftOut(name=told.photos[i], reason=text) for i, text in texts]
     return [first, *outputs.routing.reasons, *grouped(told.left_out), *grouped(with_ranges(odd))]
 
 

@@ -16,7 +16,7 @@ from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._words import many, some_photos
 from jaxba.io import Geotag, match_geotags, parse_geotags
 from jaxba.report import Told, grouped
-from jaxba.scene import Attitude, Left, Photo, PhotoFile
+from jaxba.scene import Attitude, LeftOut, Photo, PhotoFile
 from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
 
 _SHOWN, _SHOWN_CAMERAS = 3, 5
@@ -45,7 +45,7 @@ class Outputs:
     """- `photos`: usable frames by name. `left_out`: files that are none, with the reason."""
 
     photos: tuple[Photo, ...]
-    left_out: tuple[Left, ...]
+    left_out: tuple[LeftOut, ...]
     notes: tuple[str, ...] = ()
 
 
@@ -60,20 +60,20 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     images = [file for file in files if _suffix(file) in IMAGE_SUFFIXES]
     if not images:
         raise JaxbaError(f"there is no photo: the folder holds {_counted(files)}; give one with JPEG or TIFF photos.")
-    left_out = [Left(name=f.name, reason=_RAW_CURE) for f in files if _suffix(f) in RAW_SUFFIXES]
+    left_out = [LeftOut(name=f.name, reason=_RAW_CURE) for f in files if _suffix(f) in RAW_SUFFIXES]
     photos: list[Photo] = []
     first: dict[str, str] = {}
     for file in images:
         if file.sha256 in first:
             reason = f"is the same file as {first[file.sha256]}; delete one of them."
-            left_out.append(Left(name=file.name, reason=reason))
+            left_out.append(LeftOut(name=file.name, reason=reason))
             continue
         first[file.sha256] = file.name
         try:
             photo = read_photo(file, focal_px=params.focal, max_focal_deviation=params.max_focal_deviation)
         except JaxbaError as error:
             reason = str(error).removeprefix(str(file.path)).lstrip(": ")
-            left_out.append(Left(name=file.name, reason=reason))
+            left_out.append(LeftOut(name=file.name, reason=reason))
             continue
         photos.append(photo)
     if not photos:

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from jaxba.engine._words import many
-from jaxba.scene import Control, ControlFit, Left
+from jaxba.scene import Control, ControlFit, LeftOut
 
 _SHOWN = 10
 
 
-def control_lines(control: Control, notes: Sequence[str], left_out: Sequence[Left]) -> list[str]:
+def control_lines(control: Control, notes: Sequence[str], left_out: Sequence[LeftOut]) -> list[str]:
     """Return what there is of control in a line, then the notes on it and what cannot be used."""
     if not control.num_points and not notes:
         return ["no list of control points"]

@@ -4,13 +4,13 @@ import re
 from collections.abc import Sequence
 
 from jaxba.engine._words import some_photos
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 _MOST_LINES = 10
 _NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)")
 
 
-def grouped(entries: Sequence[Left]) -> list[str]:
+def grouped(entries: Sequence[LeftOut]) -> list[str]:
     """Return each reason once, with the photos that it concerns; the first few reasons where there are many."""
     names: dict[str, list[str]] = {}
     for entry in entries:
@@ -22,9 +22,9 @@ def grouped(entries: Sequence[Left]) -> list[str]:
     return [*lines[:_MOST_LINES], f"and {rest} more such files, each with its reason in summary.json."]
 
 
-def with_ranges(entries: Sequence[Left]) -> list[Left]:
+def with_ranges(entries: Sequence[LeftOut]) -> list[LeftOut]:
     """Return the same, with reasons that differ in their numbers alone made one: `1028 to 1459 keypoints`."""
-    kinds: dict[str, list[Left]] = {}
+    kinds: dict[str, list[LeftOut]] = {}
     for entry in entries:
         kinds.setdefault(_NUMBER.sub("#", entry.reason), []).append(entry)
     result = []
@@ -33,5 +33,5 @@ def with_ranges(entries: Sequence[Left]) -> list[Left]:
         ends = [(min(column, key=float), max(column, key=float)) for column in columns]
         texts = iter([low if low == high else f"{low} to {high}" for low, high in ends])
         reason = re.sub("#", lambda _, texts=texts: next(texts), kind)
-        result += [Left(name=entry.name, reason=reason) for entry in alike]
+        result += [LeftOut(name=entry.name, reason=reason) for entry in alike]
     return result

@@ -11,7 +11,7 @@ from jaxba.engine._settings import from_toml
 from jaxba.engine._stage import Pipeline
 from jaxba.engine._work import collected, works
 from jaxba.report._summary import left_out_by_last_run
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +27,11 @@ class Recorded:
     """
 
     done: Any
-    stopped: Left | None
+    stopped: LeftOut | None
     killed: str | None
     running: str | None
     stale: str | None
-    failed: dict[str, tuple[Left, ...]]
+    failed: dict[str, tuple[LeftOut, ...]]
 
 
 def recorded(folder: Path, pipeline: Pipeline) -> Recorded:
@@ -46,7 +46,7 @@ def recorded(folder: Path, pipeline: Pipeline) -> Recorded:
     given, stage_now = project.read_given()
     running = holder(project.folder)
     done = pipeline.begin(files=(), settings=settings, **read_lists(given))
-    failed: dict[str, tuple[Left, ...]] = {}
+    failed: dict[str, tuple[LeftOut, ...]] = {}
     stale = None
     summary = project.read_json(SUMMARY)
     ended = summary if isinstance(summary, dict) and stage_now is None else {}
@@ -71,7 +71,7 @@ def recorded(folder: Path, pipeline: Pipeline) -> Recorded:
             failed[name] = (*failed.get(name, ()), *others)
     return Recorded(
         done=done,
-        stopped=Left(name=stopped["stage"], reason=stopped["reason"]) if isinstance(stopped, dict) else None,
+        stopped=LeftOut(name=stopped["stage"], reason=stopped["reason"]) if isinstance(stopped, dict) else None,
         killed=stage_now if running is None else None,
         running=running,
         stale=stale,

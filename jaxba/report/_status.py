@@ -16,7 +16,7 @@ from jaxba.engine._settings import Settings, from_toml
 from jaxba.engine._stage import Pipeline, Stage, left_out
 from jaxba.engine._work import collected, why_to_do, works
 from jaxba.report._summary import left_out_by_last_run
-from jaxba.scene import EdgeStatus, Left
+from jaxba.scene import EdgeStatus, LeftOut
 
 State = Literal["done", "stale", "partly done", "not done", "waits"]
 _REASONS = 3
@@ -49,8 +49,8 @@ class Status:
     """
 
     stages: tuple[Standing, ...]
-    left_out: tuple[tuple[str, Left], ...]
-    rejected: tuple[Left, ...]
+    left_out: tuple[tuple[str, LeftOut], ...]
+    rejected: tuple[LeftOut, ...]
     activity: str
 
     @property
@@ -94,7 +94,7 @@ def status(folder: Path, pipeline: Pipeline, settings: Settings) -> Status:
     )
 
 
-def _standing(project: Project, stage: Stage, done: Any, settings: Settings, died: Sequence[Left]) -> Standing:
+def _standing(project: Project, stage: Stage, done: Any, settings: Settings, died: Sequence[LeftOut]) -> Standing:
     """Return how a stage stands, and note in `done` what it made where it is done.
 
     - `died`: photos that the last run could not use in it; of those without a record the worker died.
@@ -128,14 +128,14 @@ def _waiting(project: Project, stage: Stage, before: Sequence[Standing]) -> Stan
     return Standing(stage=stage.name, state="waits", reason=f"waits for {blocking}; {was}")
 
 
-def _rejected(done: Any) -> tuple[Left, ...]:
+def _rejected(done: Any) -> tuple[LeftOut, ...]:
     if done.match is None:
         return ()
     graph = done.match.view_graph
     rows = np.flatnonzero(graph.status == EdgeStatus.REJECTED)
     names = [photo.name for photo in done.photos]
     return tuple(
-        Left(name=f"{names[i]}, {names[j]}", reason=f"{graph.num_putative[row]} matches, too few of them verified")
+        LeftOut(name=f"{names[i]}, {names[j]}", reason=f"{graph.num_putative[row]} matches, too few of them verified")
         for row, (i, j) in zip(rows, graph.pairs[rows].tolist(), strict=True)
     )
 

@@ -6,10 +6,10 @@ from typing import Any
 
 from jaxba.engine._stage import Stage, left_out
 from jaxba.report._told import Told
-from jaxba.scene import Control, Left
+from jaxba.scene import Control, LeftOut
 
 
-def told_of(done: Any, left_out: tuple[Left, ...] = ()) -> Told:
+def told_of(done: Any, left_out: tuple[LeftOut, ...] = ()) -> Told:
     """Return what the stages' `lines` and `facts` need, from what is done so far. `left_out`: by the stage in hand."""
     names = () if done.metadata is None else tuple(photo.name for photo in done.photos)
     control = Control.nothing() if done.control is None else done.control.control
@@ -22,7 +22,7 @@ def summary(
     *,
     stages_run: Sequence[str],
     lines: Mapping[str, Sequence[str]],
-    stopped: Left | None = None,
+    stopped: LeftOut | None = None,
 ) -> dict[str, Any]:
     """Return the facts of a run: what each stage says, and the `facts` of each that has made something.
 
@@ -47,13 +47,13 @@ def summary(
     return _finite(facts)
 
 
-def left_out_by_last_run(facts: object, stage: str) -> tuple[Left, ...]:
+def left_out_by_last_run(facts: object, stage: str) -> tuple[LeftOut, ...]:
     """Return what a run's summary says a stage could not use: also photos whose worker died, which leave no record.
 
     - `facts`: of `summary.json`; anything else says nothing.
     """
     entries = facts.get("left_out", ()) if isinstance(facts, dict) else ()
-    return tuple(Left(name=entry["name"], reason=entry["reason"]) for entry in entries if entry["stage"] == stage)
+    return tuple(LeftOut(name=entry["name"], reason=entry["reason"]) for entry in entries if entry["stage"] == stage)
 
 
 def _finite(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from jaxba.scene import Control, Left
+from jaxba.scene import Control, LeftOut
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,5 +14,5 @@ class Told:
     """
 
     photos: tuple[str, ...] = ()
-    left_out: tuple[Left, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
     control: Control = field(default_factory=Control.nothing)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxba.scene._photo import Left
+from jaxba.scene._photo import LeftOut
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +37,7 @@ class Block:
     observation_point: Int[np.ndarray, " observations"]
     observation_xy_px: Float[np.ndarray, "observations 2"]
     is_georeferenced: bool
-    unregistered: tuple[Left, ...] = ()
+    unregistered: tuple[LeftOut, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property

@@ -88,7 +88,7 @@ class Photo:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Left:
+class LeftOut:
     """Something left out or doubted, named with the reason: nothing is dropped in silence.
 
     - `name`: the photo, or the pair as `a.jpg, b.jpg`. `reason`: one sentence with the numbers and the cure.

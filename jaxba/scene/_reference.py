@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba.scene._photo import Left
+from jaxba.scene._photo import LeftOut
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,5 +53,5 @@ class Reference:
     attitude_std_rad: Float[np.ndarray, "images 3"]
     is_used: Bool[np.ndarray, " images"]
     height_above_ground_m: Float[np.ndarray, " images"]
-    review: tuple[Left, ...] = ()
+    review: tuple[LeftOut, ...] = ()
     notes: tuple[str, ...] = ()

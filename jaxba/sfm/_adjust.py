@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from jaxba._errors import JaxbaError
 from jaxba.ba import Problem, Solution
 from jaxba.geometry import AbstractLoss
-from jaxba.scene import Block, Control, Features, Left, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Control, Features, LeftOut, Photo, Reference, Tracks, ViewGraph
 from jaxba.sfm._complete import complete_tracks
 from jaxba.sfm._control import ControlPart, agreeing_marks
 from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, without_edges
@@ -62,8 +62,8 @@ class Adjusted:
     num_judged: int
     medians_px: tuple[float, ...]
     converged: bool
-    pruned: tuple[Left, ...]
-    lost: tuple[Left, ...]
+    pruned: tuple[LeftOut, ...]
+    lost: tuple[LeftOut, ...]
     notes: tuple[str, ...]
     mark_used: Bool[np.ndarray, " marks"]
     gnss_offset_m: Float[np.ndarray, "3"]
@@ -185,8 +185,8 @@ def _completed(
     return complete_tracks(block, tracks, features, tuple(photos), radius_px=settings.complete_radius)
 
 
-def _lost(name: str) -> Left:
-    return Left(
+def _lost(name: str) -> LeftOut:
+    return LeftOut(
         name=name,
         reason=f"fewer than {_LEAST_OBSERVATIONS} of its features fit the adjusted block; its matches may be wrong, or "
         "lie on something that moves",

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from jaxba._errors import JaxbaError
-from jaxba.scene import Block, Left, Photo, Reference, Tracks
+from jaxba.scene import Block, LeftOut, Photo, Reference, Tracks
 from jaxba.sfm._points import with_points
 from jaxba.sfm._resection import MIN_INLIERS
 
@@ -122,7 +122,7 @@ def contradictions(block: Block, reference: Reference, photos: Sequence[Photo]) 
     ]
 
 
-def unregistered(photos: Sequence[Photo], tracks: Tracks, block: Block, reasons: dict[int, str]) -> tuple[Left, ...]:
+def unregistered(photos: Sequence[Photo], tracks: Tracks, block: Block, reasons: dict[int, str]) -> tuple[LeftOut, ...]:
     """Return the photos without a pose, and what to do about each; `reasons` are those of the largest component."""
     left = {}
     registered = set(block.image_index.tolist())
@@ -141,7 +141,7 @@ def unregistered(photos: Sequence[Photo], tracks: Tracks, block: Block, reasons:
                     f"in a group of {len(component)} photos that no edge joins with the largest group of "
                     f"{len(tracks.components[0])}; map it on its own, or fly the gap."
                 )
-    return tuple(Left(name=photos[i].name, reason=left[i]) for i in sorted(left))
+    return tuple(LeftOut(name=photos[i].name, reason=left[i]) for i in sorted(left))
 
 
 def sigmas_off(block: Block, reference: Reference) -> Float[np.ndarray, " images"]:

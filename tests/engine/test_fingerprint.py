@@ -61,7 +61,7 @@ def test_an_unknown_kind_is_refused():
 
 
 def test_code_version_follows_imports_to_where_a_name_is_defined():
-    source = b"def f():\n    from jaxba.io import write_tile\n    from jaxba.scene import Left\nimport numpy"
+    source = b"def f():\n    from jaxba.io import write_tile\n    from jaxba.scene import LeftOut\nimport numpy"
     assert set(_imports(source)) == {"jaxba.io._tile", "jaxba.scene._photo", "numpy"}
 
 

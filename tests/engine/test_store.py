@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from jaxba import JaxbaError
 from jaxba.engine._key import Key
 from jaxba.engine._store import Stored, damage, load, read_record, save, save_failure
-from jaxba.scene import Attitude, Left, Photo, Position, ViewGraph
+from jaxba.scene import Attitude, LeftOut, Photo, Position, ViewGraph
 
 ONE, TWO = (Key(code, {"ratio": 0.1}, {"photo": "00"}) for code in ("one", "two"))
 
@@ -21,7 +21,7 @@ class Made:
     photos: tuple[Photo, ...]
     graph: ViewGraph
     rms: tuple[float, float, float] | None
-    left: tuple[Left, ...] = ()
+    left: tuple[LeftOut, ...] = ()
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_record_tells_key_and_contents(tmp_path, made):
 
 def test_a_second_save_replaces_the_first_and_leaves_no_rest(tmp_path, made):
     save(tmp_path / "made", made, ONE)
-    save(tmp_path / "made", dataclasses.replace(made, left=(Left(name="x", reason="y"),)), TWO)
+    save(tmp_path / "made", dataclasses.replace(made, left=(LeftOut(name="x", reason="y"),)), TWO)
     assert load(tmp_path / "made", Made).left[0].reason == "y"
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
 

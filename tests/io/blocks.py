@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxba.io import Cloud
-from jaxba.scene import Block, Left, Photo
+from jaxba.scene import Block, LeftOut, Photo
 
 MODELS = {
     "SIMPLE_PINHOLE": (900.0, 601.5, 448.0),
@@ -75,7 +75,7 @@ def flown_block(model: str = "OPENCV with k3", *, num_points: int = 400, seed: i
         camera_index=camera_index, points_m=points[many], track_index=np.arange(count),
         rgb=rng.integers(0, 256, (count, 3)).astype(np.uint8), observation_image=image, observation_point=point,
         observation_xy_px=xy + noise, is_georeferenced=True,
-        unregistered=(Left(name=names[3], reason="too few matches"), Left(name=names[6], reason="blurred")),
+        unregistered=(LeftOut(name=names[3], reason="too few matches"), LeftOut(name=names[6], reason="blurred")),
     )  # fmt: skip
     mean = np.bincount(point, error, minlength=count) / np.bincount(point, minlength=count)
     return Flown(block, photos, error, mean)

@@ -23,14 +23,19 @@ from jaxba.engine._parameters import Parameters
 from jaxba.pipeline import STAGES, Run
 from jaxba.pipeline._stages import Stage
 from jaxba.report import told_of
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 
 EVERY = pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
 
 
 @pytest.fixture(scope="module")
-def done(made: Survey) -> Run:
-    run = made.run()
+def survey(made: Survey, tmp_path_factory: pytest.TempPathFactory) -> Survey:
+    return made.copy(tmp_path_factory.mktemp("contract"))
+
+
+@pytest.fixture(scope="module")
+def done(survey: Survey) -> Run:
+    run = survey.run()
     assert run.stages_run == ()
     return run
 
@@ -91,7 +96,7 @@ def test_a_stage_says_what_it_made_in_words_and_in_plain_values(stage: Stage, do
 
 @EVERY
 def test_a_stage_says_what_it_left_out_once(stage: Stage, done: Run):
-    left = Left(name="IMG_1.JPG", reason="it is broken.")
+    left = LeftOut(name="IMG_1.JPG", reason="it is broken.")
     lines = stage.module.lines(getattr(done.done, stage.name), told_of(done.done, (left,)))
     others = stage.module.lines(getattr(done.done, stage.name), told_of(done.done))
     said = [line for line in lines if "IMG_1.JPG" in line]
@@ -100,24 +105,24 @@ def test_a_stage_says_what_it_left_out_once(stage: Stage, done: Run):
 
 
 @EVERY
-def test_a_stage_is_pure(stage: Stage, done: Run, made: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_stage_is_pure(stage: Stage, done: Run, survey: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Run once more, it makes what the run made, changes neither its inputs nor the process, and writes no file."""
     for library in ("cv2", "pyogrio"):  # set variables of their own when they are first imported
         importlib.import_module(library)
-    inputs, digest = one_work(stage, done, made.project.parent)
+    inputs, digest = one_work(stage, done, survey.project.parent)
     if stage.name == "export":
         (tmp_path / "export").mkdir()
         inputs = dataclasses.replace(inputs, folder=tmp_path / "export")
     (tmp_path / "cwd").mkdir()
     monkeypatch.chdir(tmp_path / "cwd")
     params = stage.module.Params(nfeatures=2000) if stage.name == "features" else stage.module.Params()
-    before, state = (fingerprint(inputs), tree(made.project), tree(made.photos)), global_state()
+    before, state = (fingerprint(inputs), tree(survey.project), tree(survey.photos)), global_state()
     outputs = stage.module.run(inputs, params)
     after = global_state()
     # jax and others add variables of their own when they are first used; none that was set may change
     after["environ"] = {name: value for name, value in after["environ"].items() if name in state["environ"]}
     assert {name: value for name, value in after.items() if value != state[name]} == {}
-    assert before == (fingerprint(inputs), tree(made.project), tree(made.photos))
+    assert before == (fingerprint(inputs), tree(survey.project), tree(survey.photos))
     assert isinstance(outputs, stage.module.Outputs) and fingerprint(outputs) == digest
     assert list((tmp_path / "cwd").iterdir()) == []
     _store.save(tmp_path / "saved", outputs, Key("code", {}, {}))

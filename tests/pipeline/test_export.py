@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from jaxba._errors import JaxbaError
 from jaxba.io import read_tile
 from jaxba.pipeline import adjust, crs, export
-from jaxba.scene import Left, Photo, Position, Reference
+from jaxba.scene import LeftOut, Photo, Position, Reference
 
 LON, LAT, HEIGHT = -92.0, 46.8, 198.0
 FILES = {
@@ -240,7 +240,7 @@ def test_real_photos_lie_where_their_tags_say(data_dir: Path, tmp_path: Path):
     turned = [np.eye(3)] * 6
     block = replace(
         block, image_index=np.arange(6), quaternion=np.tile([1.0, 0, 0, 0], (6, 1)), unregistered=(
-            Left(name=photos[7].name, reason="no overlap"),),
+            LeftOut(name=photos[7].name, reason="no overlap"),),
         translation_m=-np.einsum("nij,nj->ni", turned, reference.xyz_m[rows]),
     )  # fmt: skip
     adjusted = replace(adjusted_outputs(flown), block=block)

@@ -17,7 +17,7 @@ from jaxba.engine._store import read_record
 from jaxba.engine._work import run_one
 from jaxba.pipeline import Event, features
 from jaxba.pipeline.features import check_store
-from jaxba.scene import Left, Photo
+from jaxba.scene import LeftOut, Photo
 from jaxba.vision import store_bytes
 
 
@@ -53,7 +53,7 @@ def test_too_many_photos_that_fail_stop_the_run_with_the_reasons_and_the_rest_is
 
 def test_reasons_are_said_once_with_their_photos_the_commonest_first():
     reasons = {"a": "odd.", **dict.fromkeys("bcde", "cut"), "f": "x", "g": "y"}
-    failed = [Left(name=name, reason=reason) for name, reason in reasons.items()]
+    failed = [LeftOut(name=name, reason=reason) for name, reason in reasons.items()]
     with pytest.raises(JaxbaError) as error:
         check_failures("match", failed, 10, Resources(max_failed=0.6))
     assert (

@@ -23,7 +23,7 @@ from jaxba.report.diagnosis import RULES, diagnose
 from jaxba.report.diagnosis._adjustment import out_of_steps
 from jaxba.report.diagnosis._diagnosis import Diagnosis
 from jaxba.report.diagnosis._limits import crashed, over_memory
-from jaxba.scene import Attitude, Left
+from jaxba.scene import Attitude, LeftOut
 from jaxba.sfm import _rounds
 from jaxba.simulation import PhotoTags, jpeg_with_tags
 
@@ -255,8 +255,8 @@ def test_workers_that_ended_are_named_by_what_they_died_of(made: Survey):
         "its worker process was killed by {} twice: out of memory, or a broken file",
     )
     lost = (
-        Left(name="SIM_0001.JPG", reason=died.format("SIGKILL")),
-        Left(name="SIM_0002.JPG", reason=died.format("SIGSEGV")),
+        LeftOut(name="SIM_0001.JPG", reason=died.format("SIGKILL")),
+        LeftOut(name="SIM_0002.JPG", reason=died.format("SIGSEGV")),
     )
     case = dataclasses.replace(case, failed={"features": lost})
     memory, crash = over_memory(case), crashed(case)

@@ -7,7 +7,7 @@ import pytest
 from simulated import Simulated, simulate, true_block
 
 from jaxba.report import sentences
-from jaxba.scene import Block, Left, Reference
+from jaxba.scene import Block, LeftOut, Reference
 from jaxba.sfm import Adjusted, Settings, Uncertainty, adjust, findings, gnss_fit, height_above_ground, with_points
 
 
@@ -131,8 +131,8 @@ def test_images_with_few_points_are_named(adjusted: Adjusted, survey: Simulated)
 def test_what_the_rounds_left_out_is_told(adjusted: Adjusted, survey: Simulated) -> None:
     left = replace(
         adjusted,
-        pruned=(Left(name="a.jpg, b.jpg", reason="their 60 matches are off by 5.1 px"),),
-        lost=(Left(name="c.jpg", reason="fewer than 3 of its features fit"),),
+        pruned=(LeftOut(name="a.jpg, b.jpg", reason="their 60 matches are off by 5.1 px"),),
+        lost=(LeftOut(name="c.jpg", reason="fewer than 3 of its features fit"),),
     )
     text = _findings(left, survey)
     assert "Edge left out: a.jpg, b.jpg: their 60 matches" in text

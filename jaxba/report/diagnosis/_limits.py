@@ -6,7 +6,7 @@ from jaxba.engine._words import some
 from jaxba.engine._workers import Resources, bytes_of, machine_memory, memory_for
 from jaxba.report._recorded import Recorded
 from jaxba.report.diagnosis._diagnosis import Diagnosis
-from jaxba.scene import Left
+from jaxba.scene import LeftOut
 from jaxba.vision import most_keypoints, store_bytes
 
 _BY_PHOTOS = ("features", "match")
@@ -90,7 +90,7 @@ def crashed(case: Recorded) -> Diagnosis | None:
     )
 
 
-def _failed(case: Recorded) -> list[Left]:
+def _failed(case: Recorded) -> list[LeftOut]:
     """Return the photos that failed where photos are worked on, each once."""
     found = {left.name: left for name in _BY_PHOTOS for left in case.failed.get(name, ())}
     return list(found.values())

@@ -1,4 +1,4 @@
-"""Sixty frames of which five are bad, each in its own way: the rest is adjusted, and the five are named.
+"""Many frames of which five are bad, each in its own way: the rest is adjusted, and the five are named.
 
 Two of them make the decoder crash and hang. That is planted in the workers from outside: Python reads
 `sitecustomize.py` from its path as it starts.
@@ -24,7 +24,8 @@ from jaxba.report import project_settings, status
 from jaxba.report.diagnosis import diagnose
 from jaxba.simulation.photos import Params, write_survey
 
-TRUNCATED, BLACK, CRASHES, HANGS, LARGE = (f"SIM_{i:04d}.JPG" for i in (14, 26, 38, 3, 50))
+TRUNCATED, BLACK, CRASHES, HANGS, LARGE = (f"SIM_{i:04d}.JPG" for i in (6, 11, 16, 3, 21))
+NUM_FRAMES, NUM_BAD = 24, 5
 CRASH_MARK, HANG_MARK = b"planted crash", b"planted hang"
 PLANT = f"""
 import multiprocessing, os, signal, time
@@ -74,8 +75,8 @@ def run(folder: Path, *arguments: str, planted: bool) -> Ended:
 
 @pytest.fixture(scope="module")
 def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("sixty")
-    write_survey(folder, Params(num_images=60, num_oblique=0, width_px=480))
+    folder = tmp_path_factory.mktemp("frames")
+    write_survey(folder, Params(num_images=NUM_FRAMES, num_oblique=0, width_px=480))
     photos = folder / "photos"
     content = (photos / TRUNCATED).read_bytes()
     (photos / TRUNCATED).write_bytes(content[: len(content) // 2])
@@ -95,9 +96,9 @@ def first(survey: Path) -> Ended:
 
 
 @pytest.mark.slow
-def test_fifty_five_frames_are_adjusted(survey: Path, first: Ended):
+def test_the_good_frames_are_adjusted(survey: Path, first: Ended):
     facts = json.loads((survey / "project" / "summary.json").read_text())
-    assert first.code == 0 and facts["adjust"]["images"] == 55 and facts["adjust"]["median_px"] < 0.5
+    assert first.code == 0 and facts["adjust"]["images"] == NUM_FRAMES - NUM_BAD and facts["adjust"]["median_px"] < 0.5
     assert first.of_kind("run_end")[0]["stages_run"] == facts["stages_run"]
 
 
@@ -124,7 +125,7 @@ def test_status_and_diagnosis_name_them_too(survey: Path, first: Ended):
     found = status(survey / "project", PIPELINE, project_settings(survey / "project", PIPELINE))
     assert found.is_done and {left.name for _, left in found.left_out} == {TRUNCATED, BLACK, CRASHES, HANGS, LARGE}
     stage = next(stage for stage in found.stages if stage.stage == "features")
-    assert (stage.num_done, stage.num_all) == (57, 60)  # three without a record
+    assert (stage.num_done, stage.num_all) == (NUM_FRAMES - 3, NUM_FRAMES)  # three without a record
     causes = {diagnosis.name: diagnosis for diagnosis in diagnose(survey / "project", PIPELINE)}
     assert causes["out of memory"].figures["photos"] == [LARGE] and causes["crash"].figures["photos"] == [CRASHES]
     assert "SIGSEGV" in causes["crash"].cause and "--max-memory" in causes["out of memory"].cure
@@ -137,7 +138,9 @@ def test_each_line_of_the_log_is_one_event_and_they_tell_the_whole_run(first: En
     assert stages == [event["stage"] for event in first.of_kind("stage_end")] and stages[0] == "metadata"
     assert [event["event"] for event in (first.events[0], first.events[-1])] == ["run_begin", "run_end"]
     done = first.of_kind("progress", stage="features")
-    assert [event["done"] for event in done] == list(range(61)) and {event["total"] for event in done} == {60}
+    assert [event["done"] for event in done] == list(range(NUM_FRAMES + 1)) and {event["total"] for event in done} == {
+        NUM_FRAMES
+    }
     shares = [event["share"] for event in done]
     assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == pytest.approx(1)
     assert any(event["text"].startswith("round 1, median") for event in first.of_kind("step", stage="adjust"))

@@ -140,6 +140,12 @@ class Project:
         return tuple(found)
 
 
+def refuse_photo_folder(photos: Path, out: Path) -> None:
+    """Raise `JaxbaError` where a project would be made in the folder of the photos; nothing is written there."""
+    if photos.resolve() == out.resolve():
+        raise JaxbaError(f"{photos}: is the folder of the photos; choose another folder for --out.")
+
+
 def read_lists(given: Given) -> dict[str, Any]:
     """Return name and text of the lists, as `Done` takes them; `geo.txt` among the photos is one of tags."""
     geotags = given.geotags
@@ -170,8 +176,6 @@ def _files_below(photos: Path, project: Path) -> list[tuple[str, Path]]:
         raise JaxbaError(f"{photos}: there is no such folder; give the folder that holds the photos.")
     if not photos.is_dir():
         raise JaxbaError(f"{photos}: is a file; give the folder that holds the photos.")
-    if photos.resolve() == project.resolve():
-        raise JaxbaError(f"{photos}: is the folder of the photos; choose another folder for --out.")
     been, found = {project.resolve()}, []
     for root, folders, names in os.walk(photos, onerror=_raise_unreadable, followlinks=True):
         place = Path(root).resolve()

@@ -19,7 +19,7 @@ from jaxba.engine._limits import check_failures
 from jaxba.engine._lock import locked
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._pool import Item, fewer_workers, work as work_on
-from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists
+from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists, refuse_photo_folder
 from jaxba.engine._settings import Settings, to_toml
 from jaxba.engine._stage import Stage, left_out
 from jaxba.engine._work import Work, collected, failures, run_one, why_to_do, without_path, works
@@ -56,6 +56,7 @@ def run_pipeline(
     """
     if until is not None and until not in NAMES:
         raise JaxbaError(f"stage {until!r}: choose one of {', '.join(NAMES)}.")
+    refuse_photo_folder(photos, out)
     project = Project(out)
     with locked(project.folder):
         project.remove_leftovers()

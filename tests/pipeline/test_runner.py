@@ -261,3 +261,4 @@ def test_parameters_of_the_last_run_lie_in_the_project(made: Survey):
 def test_a_project_folder_is_not_the_photo_folder(tmp_path: Path):
     with pytest.raises(JaxbaError, match="is the folder of the photos; choose another folder for --out"):
         run_pipeline(tmp_path, tmp_path, PIPELINE.settings)
+    assert not list(tmp_path.iterdir())  # nothing among the user's photos

@@ -73,7 +73,8 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
 def code_version(module: str) -> str:
     """Return a fingerprint of the source of a stage's module and of all that it imports of jaxba, directly or not.
 
-    The module's functions `lines` and `facts` do not count, nor what is imported for them alone.
+    The functions `lines` and `facts` of a stage do not count, nor what is imported for them alone. Stages are the
+    module itself and the public ones beside it, whose outputs it may import.
     """
     return fingerprint(_reached(module)[0])
 
@@ -93,18 +94,20 @@ def _reached(module: str) -> tuple[dict[str, bytes], set[str]]:
 
     Behind a package that is imported whole, as in `from jaxba import io`, all of its names are reached.
     """
-    path = _source(module)
-    assert path is not None
-    source, waiting = _without_words(path.read_bytes())
-    sources, others = {module: source}, set()
+    assert _source(module) is not None
+    package = module.rpartition(".")[0]
+    sources, others, waiting = {}, set(), [module]
     while waiting:
         name = waiting.pop()
         path = _source(name)
         if path is None:
             others.add(name)
         elif name not in sources:
-            sources[name] = path.read_bytes()
-            waiting.extend(_imports(sources[name]))
+            source = path.read_bytes()
+            within, _, last = name.rpartition(".")
+            is_stage = name == module or (within == package and not last.startswith("_"))
+            sources[name], imports = _without_words(source) if is_stage else (source, _imports(source))
+            waiting.extend(imports)
             stub = path.with_suffix(".pyi")
             if stub.is_file():
                 waiting.extend(_behind(name, stub))
@@ -121,10 +124,11 @@ def _behind(package: str, stub: Path) -> Iterator[str]:
 _OF_WORDS = ("lines", "facts")
 
 
-def _without_words(source: bytes) -> tuple[bytes, list[str]]:
+@functools.cache
+def _without_words(source: bytes) -> tuple[bytes, tuple[str, ...]]:
     """Return a stage's source without its functions that only say what was made, and the modules that the rest imports.
 
-    Import statements at the top level are cut out, too: they are told by the modules.
+    Of the import statements at the top level, the names that the rest uses are kept.
     """
     tree = ast.parse(source)
     says = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name in _OF_WORDS]
@@ -137,7 +141,8 @@ def _without_words(source: bytes) -> tuple[bytes, list[str]]:
     used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
     for node in imports:
         node.names = [alias for alias in node.names if (alias.asname or alias.name).partition(".")[0] in used]
-    return b"".join(lines), sorted(_imported(tree))
+    kept = [ast.unparse(node) for node in imports if node.names]  # the same name may come to stand for something else
+    return b"".join(lines) + "\n".join(kept).encode(), tuple(sorted(_imported(tree)))
 
 
 @functools.cache

@@ -19,7 +19,7 @@ class Pair:
 
 def forget() -> None:
     """Forget what was read of sources."""
-    for function in (code_version, _fingerprint._reached, _fingerprint._imports):
+    for function in (code_version, _fingerprint._reached, _fingerprint._imports, _fingerprint._without_words):
         function.cache_clear()
 
 
@@ -108,16 +108,21 @@ def with_change(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("module", "before", "after"),
+    ("stage", "module", "before", "after"),
     [
-        ("jaxba.pipeline.adjust", "median {outputs.median_px:.2f} px", "a median of {outputs.median_px:.2f} px"),
-        ("jaxba.pipeline.adjust", "import Told,", "import Picture, Told,"),
-        ("jaxba.report._reasons", "more such files", "more of these"),
-        ("jaxba.report._findings", "look at the edges", "see the edges"),
+        ("adjust", "jaxba.pipeline.adjust", "median {outputs.median_px:.2f} px", "{outputs.median_px:.2f} px median"),
+        ("adjust", "jaxba.pipeline.adjust", "import Told,", "import Picture, Told,"),
+        ("adjust", "jaxba.report._reasons", "more such files", "more of these"),
+        ("adjust", "jaxba.report._findings", "look at the edges", "see the edges"),
+        # export imports the stage adjust, and match the stage features
+        ("export", "jaxba.pipeline.adjust", "median {outputs.median_px:.2f} px", "{outputs.median_px:.2f} px median"),
+        ("export", "jaxba.report._findings", "look at the edges", "see the edges"),
+        ("match", "jaxba.pipeline.features", "keypoints, median", "features, median"),
+        ("match", "jaxba.report._reasons", "more such files", "more of these"),
     ],
 )
-def test_other_words_rerun_nothing(with_change, module: str, before: str, after: str):
-    stage = "jaxba.pipeline.adjust"
+def test_other_words_rerun_nothing(with_change, stage: str, module: str, before: str, after: str):
+    stage = f"jaxba.pipeline.{stage}"
     assert with_change(stage, module, before, after) == code_version(stage)
 
 
@@ -125,6 +130,8 @@ def test_other_words_rerun_nothing(with_change, module: str, before: str, after:
     ("stage", "module", "before", "after"),
     [
         ("adjust", "jaxba.pipeline.adjust", "sigmas = controlled.sigmas", "sigmas = sigmas"),
+        ("adjust", "jaxba.pipeline.adjust", "import numpy as np", "import jax.numpy as np"),  # the same name
+        ("match", "jaxba.pipeline.features", "def run(inputs", "def run( inputs"),  # detects where SIFT is the fallback
         ("adjust", "jaxba.sfm._findings", "_OUTLIER = 3.0", "_OUTLIER = 4.0"),
         ("export", "jaxba.io._las", "def write_las(", "def write_laz("),  # of a package that is imported whole
         ("export", "jaxba.report._picture", "MOST_POINTS = 200_000", "MOST_POINTS = 100_000"),  # is a file of its own

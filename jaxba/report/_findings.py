@@ -6,7 +6,6 @@ Which findings hold is decided in `jaxba.sfm` by figures alone; other words here
 import math
 from collections.abc import Callable, Sequence
 
-from jaxba.engine._words import many
 from jaxba.report._control_findings import CONTROL_WORDS
 from jaxba.scene import Finding
 
@@ -65,7 +64,7 @@ def _image_lost(name: str, reason: str) -> str:
 
 def _few_points(names: Sequence[str], points: Sequence[int], least: int) -> str:
     return (
-        f"{many(len(names), 'image')} with fewer than {least} points, so weakly placed: "
+        f"{_many(len(names), 'image')} with fewer than {least} points, so weakly placed: "
         f"{_named(names, [f'{count} points' for count in points])}. More overlap or features cure it."
     )
 
@@ -75,7 +74,7 @@ def _positions_contradict(
 ) -> str:
     figures = [", ".join(f"{r:+.1f}" if math.isfinite(r) else "none" for r in row) + " m" for row in residual_m]
     return (
-        f"{many(len(names), 'measured position')} of {measured} contradict the photos by more than "
+        f"{_many(len(names), 'measured position')} of {measured} contradict the photos by more than "
         f"{sigmas:g} robust sigmas and hardly count (adjusted minus measured, east, north, up): "
         f"{_named(names, figures)}."
     )
@@ -159,7 +158,7 @@ def _principal_point_off(camera: str, parameter: str, value: float, middle: floa
 
 def _weak_positions(names: Sequence[str], std_m: Sequence[float], median_m: float) -> str:
     return (
-        f"{many(len(names), 'image')} with a position sigma over five times the median of {median_m:.2g} m: "
+        f"{_many(len(names), 'image')} with a position sigma over five times the median of {median_m:.2g} m: "
         f"{_named(names, [f'{std:.2g} m' for std in std_m])}."
     )
 
@@ -170,6 +169,11 @@ def _common_offset(median_m: float, receiver_std_m: float) -> str:
         f"receiver have an offset in common, up to their own sigma of {receiver_std_m:.1f} m horizontally, which "
         "is not in these: only control or a differential receiver removes it."
     )
+
+
+def _many(count: int, noun: str) -> str:
+    """Return the count with its noun; without separators, as all other numbers here."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _named(names: Sequence[str], figures: Sequence[str]) -> str:

@@ -13,20 +13,42 @@ from jaxba.report import sentence
 from jaxba.report._findings import WORDS
 from jaxba.scene import Finding
 
-NAN = float("nan")
+NAN, INF = float("nan"), float("inf")
 CASES = [
-    (Finding.of("note", text="A note."), "A note."),
+    (
+        Finding.of("note", text="A note."),
+        "A note.",
+    ),
     (
         Finding.of("not settled", medians_px=[1.0, 0.8, 0.55]),
-        "changed after 3 rounds (1.00, 0.80, 0.55 px); set adjust",
+        "The median error still changed after 3 rounds (1.00, 0.80, 0.55 px); set adjust.max_rounds higher, or "
+        "look at the edges and images named here.",
     ),
-    (Finding.of("not converged", advice="look there."), "The last solve: look there."),
-    (Finding.of("large median", median_px=4.25), "The median error is 4.2 px: check the focal length"),
-    (Finding.of("edge left out", name="a, b", reason="off"), "Edge left out: a, b: off."),
-    (Finding.of("image lost", name="a", reason="off"), "Image lost in the adjustment: a: off."),
+    (
+        Finding.of("not converged", advice="look there."),
+        "The last solve: look there.",
+    ),
+    (
+        Finding.of("large median", median_px=4.25),
+        "The median error is 4.2 px: check the focal length against the sensor's specification, and whether "
+        "cameras or zooms are mixed.",
+    ),
+    (
+        Finding.of("edge left out", name="a, b", reason="off"),
+        "Edge left out: a, b: off.",
+    ),
+    (
+        Finding.of("image lost", name="a", reason="off"),
+        "Image lost in the adjustment: a: off.",
+    ),
     (
         Finding.of("few points", names=["a", "b"], points=[7, 12], least=20),
-        "2 images with fewer than 20 points, so weakly placed: a (7 points), b (12 points). More overlap",
+        "2 images with fewer than 20 points, so weakly placed: a (7 points), b (12 points). More overlap or "
+        "features cure it.",
+    ),
+    (
+        Finding.of("few points", names=["a"], points=[7], least=20),
+        "1 image with fewer than 20 points, so weakly placed: a (7 points). More overlap or features cure it.",
     ),
     (
         Finding.of("positions contradict", names=["a"], residual_m=[[-2.0, 0.04, NAN]], measured=12, sigmas=3.0),
@@ -35,10 +57,22 @@ CASES = [
     ),
     (
         Finding.of("positions scatter", axes=["east", "up"], scale_m=[0.2, 1.0], stated_m=[0.03, 0.06]),
-        "(east 0.2 m instead of 0.03 m, up 1 m instead of 0.06 m); the sigmas were enlarged to that.",
+        "Measured positions scatter more than their sigmas say (east 0.2 m instead of 0.03 m, up 1 m instead of "
+        "0.06 m); the sigmas were enlarged to that. Check the antenna's offset, the time between exposure and "
+        "fix, and whether the receiver had its fixed solution.",
     ),
-    (Finding.of("heights drift", drift_m=80.04, share=0.97), "drift against the photos by 80.0 m from"),
-    (Finding.of("no heights"), "No measured height is used, so the block's height and its tilt"),
+    (
+        Finding.of("heights drift", drift_m=80.04, share=0.97),
+        "Measured heights drift against the photos by 80.0 m from the first to the last photo, which explains 97%"
+        " of their residuals: the receiver's altitude cannot be trusted. Leave heights out, or use ground "
+        "control.",
+    ),
+    (
+        Finding.of("no heights"),
+        "No measured height is used, so the block's height and its tilt are those of the start values and not "
+        "measured: heights and slopes of the results are not to be relied on. Add ground control, or photos with "
+        "heights that can be trusted.",
+    ),
     (
         Finding.of(
             "focal and height",
@@ -50,56 +84,114 @@ CASES = [
             above_ground_m=46.0,
             above_take_off_m=40.0,
         ),
-        "trade off (photos look straight down): fx is 1000.0 px with a sigma of 30.0 px (3.0%), which alone makes the "
-        "height above ground of 50.0 m uncertain by 1.5 m. The cameras are 46.0 m above the ground points by the "
-        "adjustment and 40.0 m above the take-off point by the flight's own record (+15%); a focal length of 870 px",
+        "Focal length and height trade off (photos look straight down): fx is 1000.0 px with a sigma of 30.0 px "
+        "(3.0%), which alone makes the height above ground of 50.0 m uncertain by 1.5 m. The cameras are 46.0 m "
+        "above the ground points by the adjustment and 40.0 m above the take-off point by the flight's own record"
+        " (+15%); a focal length of 870 px would agree with it, if the ground lies at the height of the take-off "
+        "point. Hold the focal length at a calibrated value (metadata.focal), fly a second height, add oblique "
+        "photos, or measure ground control.",
     ),
     (
         Finding.of("focal and height", parameter="f", focal_px=1000.0, std_px=30.0, height_m=50.0, looks="around"),
         "Focal length and height trade off: f is 1000.0 px with a sigma of 30.0 px (3.0%), which alone makes the "
-        "height above ground of 50.0 m uncertain by 1.5 m. Hold the focal length",
+        "height above ground of 50.0 m uncertain by 1.5 m. Hold the focal length at a calibrated value "
+        "(metadata.focal), fly a second height, add oblique photos, or measure ground control.",
+    ),
+    (
+        Finding.of(
+            "focal and height",
+            parameter="fx",
+            focal_px=1000.0,
+            std_px=NAN,
+            height_m=50.0,
+            looks="down from one height",
+            above_ground_m=46.0,
+            above_take_off_m=50.0,
+        ),
+        "Focal length and height trade off (all photos look straight down from one height): fx is 1000.0 px with "
+        "a sigma of nan px (nan%), which alone makes the height above ground of 50.0 m uncertain by nan m. The "
+        "cameras are 46.0 m above the ground points by the adjustment and 50.0 m above the take-off point by the "
+        "flight's own record (-8%); a focal length of 1087 px would agree with it, if the ground lies at the "
+        "height of the take-off point. Hold the focal length at a calibrated value (metadata.focal), fly a second"
+        " height, add oblique photos, or measure ground control.",
     ),
     (
         Finding.of("at bound", camera="DJI", parameter="k1", value=-0.5, low=-0.5, high=0.5),
-        "Camera DJI: k1 is at its bound (-0.5, allowed -0.5 to 0.5): the calibration",
+        "Camera DJI: k1 is at its bound (-0.5, allowed -0.5 to 0.5): the calibration takes up another error. "
+        "Check the focal length and the camera model, add oblique photos or control, or hold it fixed.",
     ),
     (
         Finding.of("focal moved", camera="DJI", parameter="fx", value=900.0, before=1000.0),
-        "Camera DJI: fx moved from 1000 to 900 px (-10.0%). Compare",
+        "Camera DJI: fx moved from 1000 to 900 px (-10.0%). Compare with the sensor's specification.",
     ),
     (
         Finding.of("principal point off", camera="DJI", parameter="cx", value=660.0, middle=600.0),
-        "Camera DJI: the principal point's cx is +60 px off the middle",
+        "Camera DJI: the principal point's cx is +60 px off the middle; in a block without cross strips it may "
+        "stand for a tilt. Photos turned by 90 degrees tell.",
     ),
     (
         Finding.of("weak positions", names=[f"p{i}" for i in range(12)], std_m=[0.5] * 12, median_m=0.02),
-        "12 images with a position sigma over five times the median of 0.02 m: p0 (0.5 m)",
+        "12 images with a position sigma over five times the median of 0.02 m: p0 (0.5 m), p1 (0.5 m), p2 (0.5 "
+        "m), p3 (0.5 m), p4 (0.5 m), p5 (0.5 m), p6 (0.5 m), p7 (0.5 m), p8 (0.5 m), p9 (0.5 m) and 2 more.",
     ),
-    (Finding.of("common offset", median_m=0.02, receiver_std_m=3.0), "up to their own sigma of 3.0 m horizontally"),
-    (Finding.of("control without a place"), "The block has no place on earth"),
+    (
+        Finding.of("common offset", median_m=0.02, receiver_std_m=3.0),
+        "Position sigmas (median 0.02 m) are about the mean of all GNSS positions. Those of a single receiver "
+        "have an offset in common, up to their own sigma of 3.0 m horizontally, which is not in these: only "
+        "control or a differential receiver removes it.",
+    ),
+    (
+        Finding.of("control without a place"),
+        "The block has no place on earth, so that its control and check points cannot be compared with it.",
+    ),
     (
         Finding.of("control not marked twice", names=["g1", "g2"], marks=[1, 0]),
-        "not used: g1 (1 mark), g2 (0 marks). Mark",
+        "Points that are not marked in two adjusted photos or more, and not used: g1 (1 mark), g2 (0 marks). Mark"
+        " them in more photos.",
     ),
     (
         Finding.of("few control points", count=2, least=3, is_fit=True),
-        "2 control points can be used where 3 are needed, so no fit",
+        "2 control points can be used where 3 are needed, so no fit was made. Mark more of them.",
     ),
-    (Finding.of("few control points", count=2, least=3, is_fit=False), "so they do not fix the block by themselves"),
-    (Finding.of("control on a line", count=4), "The 4 control points lie on a line"),
-    (Finding.of("control horizontal only"), "Control is horizontal only and no position has a height"),
-    (Finding.of("marks contradict", marks=[["g1", "a.jpg"]], std_px=1.0), "left out: g1 in a.jpg. Look at them."),
+    (
+        Finding.of("few control points", count=2, least=3, is_fit=False),
+        "2 control points can be used where 3 are needed, so they do not fix the block by themselves. Mark more "
+        "of them.",
+    ),
+    (
+        Finding.of("control on a line", count=4),
+        "The 4 control points lie on a line, so that they do not hold the block from turning about it. Survey "
+        "some to its sides.",
+    ),
+    (
+        Finding.of("control horizontal only"),
+        "Control is horizontal only and no position has a height, so the block's height and tilt are those of the"
+        " start values (cameras look down on average): heights and slopes are not to be relied on. Survey the "
+        "heights of three control points or more.",
+    ),
+    (
+        Finding.of("marks contradict", marks=[["g1", "a.jpg"]], std_px=1.0),
+        "Marks that contradict the others of their point by over 5 sigmas (control.mark_std_px=1), left out: g1 "
+        "in a.jpg. Look at them.",
+    ),
     (
         Finding.of("marks off", median_px=9.0, std_px=1.0),
-        "Marks miss their points by 9.0 px in the median (sigma 1 px)",
+        "Marks miss their points by 9.0 px in the median (sigma 1 px): were they set in photos of another size "
+        "(control.mark_width_px), or counted from another corner?",
     ),
-    (Finding.of("marks disagree", marks=2, name="g1", rms_px=8.0), "The 2 marks of g1 do not agree (RMS 8.0 px)"),
+    (
+        Finding.of("marks disagree", marks=2, name="g1", rms_px=8.0),
+        "The 2 marks of g1 do not agree (RMS 8.0 px), and which is wrong cannot be told: look at them, or mark "
+        "more photos.",
+    ),
     (
         Finding.of(
             "control scatters", count=5, axes=["horizontally", "in height"], scatter_m=[0.5, 1.0], stated_m=[0.02, 0.03]
         ),
-        "The 5 control points contradict the block, most of them and not one: they scatter by 0.5 m horizontally where "
-        "their sigma is 0.02 m, 1 m in height where their sigma is 0.03 m. Their sigmas were enlarged",
+        "The 5 control points contradict the block, most of them and not one: they scatter by 0.5 m horizontally "
+        "where their sigma is 0.02 m, 1 m in height where their sigma is 0.03 m. Their sigmas were enlarged to "
+        "that. Compare how they were surveyed with control.std_h and control.std_v, and check their CRS, names "
+        "and marks.",
     ),
     (
         Finding.of(
@@ -111,14 +203,80 @@ CASES = [
             limit=3.29,
             method="adjust",
         ),
-        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, none m east, north, up, 9.0 "
-        "sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name and its marks. "
-        "It pulls the block no harder",
+        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, none m east, north, up, "
+        "9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name and "
+        "its marks. It pulls the block no harder than a point that is off by 3 sigmas; make it a check point "
+        "(control.check) to leave it out.",
+    ),
+    (
+        Finding.of(
+            "control point contradicts",
+            name="c1",
+            is_check=True,
+            residual_m=[0.5, -0.1, 2.0],
+            over_sigma=9.0,
+            limit=3.29,
+            method="adjust",
+        ),
+        "Check point c1 contradicts the block: adjusted minus surveyed +0.500, -0.100, +2.000 m east, north, up, "
+        "9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name and "
+        "its marks.",
+    ),
+    (
+        Finding.of(
+            "control point contradicts",
+            name="g1",
+            is_check=False,
+            residual_m=[0.5, -0.1, 2.0],
+            over_sigma=9.0,
+            limit=3.29,
+            method="helmert",
+        ),
+        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, +2.000 m east, north, "
+        "up, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
+        "and its marks. It was left out of the fit where others remained.",
+    ),
+    (
+        Finding.of(
+            "control point contradicts",
+            name="g1",
+            is_check=False,
+            residual_m=[0.5, -0.1, 2.0],
+            over_sigma=9.0,
+            limit=3.29,
+            method="affine",
+        ),
+        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, +2.000 m east, north, "
+        "up, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
+        "and its marks. It was left out of the fit where others remained.",
+    ),
+    (
+        Finding.of(
+            "control point contradicts",
+            name="g1",
+            is_check=False,
+            residual_m=[0.5, -0.1, 2.0],
+            over_sigma=9.0,
+            limit=3.29,
+            method="none",
+        ),
+        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, +2.000 m east, north, "
+        "up, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
+        "and its marks.",
     ),
     (
         Finding.of("gnss off control", offset_m=[1.5, -2.0, NAN], std_m=[0.03, 0.03, 0.06], is_compared=False),
-        "as control places it: +1.50, -2.00, unknown m east, north, up, for all photos in common, with sigmas of 0.03, "
-        "0.03, 0.06 m; the block follows control. Decimetres",
+        "GNSS positions minus the block as control places it: +1.50, -2.00, unknown m east, north, up, for all "
+        "photos in common, with sigmas of 0.03, 0.03, 0.06 m; the block follows control. Decimetres are the "
+        "antenna's offset; metres and tens of metres two datums or height systems; hundreds a wrong zone or "
+        "swapped axes of one of the two.",
+    ),
+    (
+        Finding.of("gnss off control", offset_m=[1.5, -2.0, 31.0], std_m=[3.0, 3.0, INF], is_compared=True),
+        "GNSS positions minus the block as control places it: +1.50, -2.00, +31.00 m east, north, up, for all "
+        "photos in common, with sigmas of 3, 3, inf m; compared only. Decimetres are the antenna's offset; metres"
+        " and tens of metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the "
+        "two.",
     ),
 ]
 
@@ -130,12 +288,17 @@ class Kept:
 
 @pytest.mark.parametrize(("finding", "words"), CASES, ids=[finding.kind for finding, _ in CASES])
 def test_a_finding_is_told_with_its_figures(finding: Finding, words: str):
-    assert words in sentence(finding)
+    assert sentence(finding) == words
 
 
 def test_more_than_ten_photos_are_counted():
     finding = next(finding for finding, _ in CASES if finding.kind == "weak positions")
     assert sentence(finding).endswith("p9 (0.5 m) and 2 more.")
+
+
+def test_photos_are_counted_without_separators():
+    many = Finding.of("few points", names=["a"] * 1200, points=[7] * 1200, least=20)
+    assert sentence(many).startswith("1200 images with fewer than 20 points") and " and 1190 more." in sentence(many)
 
 
 def test_every_kind_that_can_be_found_has_words_and_a_case():
@@ -148,4 +311,4 @@ def test_every_kind_that_can_be_found_has_words_and_a_case():
 def test_findings_are_told_alike_after_they_were_stored(tmp_path: Path):
     save(tmp_path / "kept", Kept(tuple(finding for finding, _ in CASES)), Key("code", {}, {}))
     again = load(tmp_path / "kept", Kept).findings
-    assert [sentence(finding) for finding in again] == [sentence(finding) for finding, _ in CASES]
+    assert [sentence(finding) for finding in again] == [words for _, words in CASES]

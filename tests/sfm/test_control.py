@@ -9,7 +9,7 @@ from simulated import Simulated, simulate, true_block
 
 from jaxba.ba import make_plan
 from jaxba.report import sentences
-from jaxba.scene import Control
+from jaxba.scene import Control, Finding
 from jaxba.sfm import (
     Adjusted,
     Settings,
@@ -81,8 +81,10 @@ def run(survey: Simulated, control: Control) -> tuple[Adjusted, Controlled]:
     return adjusted, apply_control(adjusted, sigmas, control, survey.reference)
 
 
-def told(survey: Simulated, control: Control, made: tuple[Adjusted, Controlled]) -> str:
-    return " ".join(sentences(control_findings(made[0], control, made[1].fit, survey.reference, survey.photos)))
+def found_on(survey: Simulated, control: Control, made: tuple[Adjusted, Controlled]) -> tuple[Finding, ...]:
+    found = control_findings(made[0], control, made[1].fit, survey.reference, survey.photos)
+    assert all(sentences(found))  # each can be told
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +113,10 @@ def test_an_offset_of_gnss_from_control_is_told_and_does_not_pull(
     fit = made[1].fit
     np.testing.assert_allclose(fit.gnss_minus_control_m, OFFSET_M, atol=4.0)  # medians of 12 with 3 and 5 m
     np.testing.assert_allclose(made[0].gnss_offset_m, -fit.gnss_minus_control_m, atol=0.3)
-    text = told(survey, points, made)
-    assert "GNSS positions minus the block as control places it" in text and "contradicts" not in text
+    found = {finding.kind: finding.figures for finding in found_on(survey, points, made)}
+    assert found["gnss off control"]["offset_m"] == fit.gnss_minus_control_m.tolist()
+    assert found["gnss off control"]["std_m"] == [3.0, 3.0, 5.0] and not found["gnss off control"]["is_compared"]
+    assert "control point contradicts" not in found
 
 
 def test_check_points_change_nothing(survey: Simulated, points: Control, made: tuple[Adjusted, Controlled]) -> None:
@@ -134,7 +138,9 @@ def test_a_control_point_that_is_off_by_a_metre_is_named_and_hardly_pulls(
     assert np.abs(other[1].fit.residual_m[3] + [0.8, 0.6, 0.0]).max() < 0.15
     pulled = np.abs(other[1].fit.adjusted_m - made[1].fit.adjusted_m)
     assert np.delete(pulled, 3, axis=0)[:, :2].max() < 0.1
-    assert "Control point gcp3 contradicts the block" in told(survey, wrong, other)
+    suspect = [f.figures for f in found_on(survey, wrong, other) if f.kind == "control point contradicts"]
+    assert [(s["name"], s["is_check"], s["method"]) for s in suspect] == [("gcp3", False, "adjust")]
+    assert suspect[0]["residual_m"] == other[1].fit.residual_m[3].tolist() and suspect[0]["over_sigma"] > 3.29
 
 
 @pytest.mark.parametrize("method", ["helmert", "affine"])

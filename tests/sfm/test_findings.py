@@ -1,13 +1,15 @@
-"""What a surveyor is told of an adjusted block: each finding with its figures, and silence where there is none."""
+"""What is found on an adjusted block: each finding with its figures, and nothing where there is none."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from simulated import Simulated, simulate, true_block
 
 from jaxba.report import sentences
-from jaxba.scene import Block, LeftOut, Reference
+from jaxba.scene import Block, Finding, LeftOut, Reference
 from jaxba.sfm import Adjusted, Settings, Uncertainty, adjust, findings, gnss_fit, height_above_ground, with_points
 
 
@@ -35,13 +37,19 @@ def adjusted(survey: Simulated) -> Adjusted:
 
 def _findings(
     adjusted: Adjusted, survey: Simulated, reference: Reference | None = None, focal_std_px: float = 5.0
-) -> str:
+) -> dict[str, dict[str, Any]]:
     block, reference = adjusted.block, reference or survey.reference
     std = np.zeros(block.camera_parameters.shape)
     std[:, :2] = focal_std_px
     sigmas = Uncertainty(np.full((block.num_images, 3), 0.02), np.full((block.num_points, 3), 0.05), std, 1.0)
     fit = gnss_fit(block, reference)
-    return "\n".join(sentences(findings(adjusted, survey.block, sigmas, fit, reference, survey.photos)))
+    return _by_kind(findings(adjusted, survey.block, sigmas, fit, reference, survey.photos))
+
+
+def _by_kind(found: Sequence[Finding]) -> dict[str, dict[str, Any]]:
+    """Return the figures by kind; each finding can be told, and none of these blocks has two of a kind."""
+    assert all(sentences(found)) and len({finding.kind for finding in found}) == len(found)
+    return {finding.kind: dict(finding.figures) for finding in found}
 
 
 def _with_block(adjusted: Adjusted, **changes: object) -> Adjusted:
@@ -50,7 +58,7 @@ def _with_block(adjusted: Adjusted, **changes: object) -> Adjusted:
 
 def test_a_good_block_has_none(adjusted: Adjusted, survey: Simulated) -> None:
     above = replace(survey.reference, height_above_ground_m=height_above_ground(adjusted.block))
-    assert _findings(adjusted, survey, above) == ""
+    assert _findings(adjusted, survey, above) == {}
 
 
 def test_height_above_ground_is_that_of_the_flight(adjusted: Adjusted) -> None:
@@ -60,15 +68,16 @@ def test_height_above_ground_is_that_of_the_flight(adjusted: Adjusted) -> None:
 def test_focal_length_that_contradicts_the_measured_height_is_reported(adjusted: Adjusted, survey: Simulated) -> None:
     measured = np.nanmedian(height_above_ground(adjusted.block)) / 1.15
     above = replace(survey.reference, height_above_ground_m=np.full(12, measured))
-    text = _findings(adjusted, survey, above)
-    assert "Focal length and height trade off (all photos look straight down from one height)" in text
-    assert f"{measured:.1f} m above the take-off point" in text and "(+15%)" in text
-    assert f"a focal length of {3652 / 1.15:.0f} px would agree" in text and "Hold the focal length" in text
+    found = _findings(adjusted, survey, above)["focal and height"]
+    assert found["looks"] == "down from one height" and found["parameter"] == "fx" and found["std_px"] == 5.0
+    assert found["above_take_off_m"] == measured and found["above_ground_m"] == pytest.approx(1.15 * measured)
+    assert found["focal_px"] == adjusted.block.camera_parameters[0, 0] and found["height_m"] == found["above_ground_m"]
 
 
 def test_a_focal_length_that_is_not_determined_is_reported(adjusted: Adjusted, survey: Simulated) -> None:
-    text = _findings(adjusted, survey, focal_std_px=182.6)
-    assert "(5.0%), which alone makes the height above ground" in text
+    found = _findings(adjusted, survey, focal_std_px=182.6)["focal and height"]
+    assert found["std_px"] / found["focal_px"] == pytest.approx(0.05, abs=5e-4)
+    assert "above_take_off_m" not in found  # the flight's record tells nothing
 
 
 def test_wrong_positions_are_named_and_left_out_of_the_rms(adjusted: Adjusted, survey: Simulated) -> None:
@@ -78,43 +87,50 @@ def test_wrong_positions_are_named_and_left_out_of_the_rms(adjusted: Adjusted, s
     fit = gnss_fit(adjusted.block, wrong)
     assert np.flatnonzero(fit.is_outlier).tolist() == [3, 8] and fit.num == 10
     assert fit.rms_m is not None and max(fit.rms_m) < 0.1
-    text = _findings(adjusted, survey, wrong)
-    assert "2 measured positions of 12" in text and "DJI_0003.JPG (-2.0, " in text and "DJI_0008.JPG" in text
+    found = _findings(adjusted, survey, wrong)["positions contradict"]
+    assert found["names"] == ["DJI_0008.JPG", "DJI_0003.JPG"] and found["measured"] == 12 and found["sigmas"] == 3.0
+    np.testing.assert_array_equal(found["residual_m"], fit.residual_m[[8, 3]])  # the farthest off first
+    np.testing.assert_allclose(found["residual_m"], [[0.0, 0, 4.0], [-2.0, 0, 0]], atol=0.25)  # 4 sigmas of 0.06 m
 
 
 def test_positions_that_scatter_more_than_they_claim_are_reported(adjusted: Adjusted, survey: Simulated) -> None:
     xyz = survey.reference.xyz_m.copy()
     xyz[:, 2] += 0.24 * np.random.default_rng(1).normal(size=12)
     wide = replace(survey.reference, xyz_m=xyz)
-    text = _findings(replace(adjusted, position_scale=np.array([1.0, 1.0, 4.0])), survey, wide)
-    assert "scatter more than their sigmas say (up " in text and "instead of 0.06 m" in text
+    found = _findings(replace(adjusted, position_scale=np.array([1.0, 1.0, 4.0])), survey, wide)["positions scatter"]
+    assert found["axes"] == ["up"] and found["stated_m"] == [0.06]
+    assert found["scale_m"] == [gnss_fit(adjusted.block, wide).scale_m[2]]
 
 
 def test_scatter_within_chance_is_no_finding(adjusted: Adjusted, survey: Simulated) -> None:
-    text = _findings(replace(adjusted, position_scale=np.array([1.6, 1.1, 1.6])), survey)
-    assert "scatter more" not in text
+    found = _findings(replace(adjusted, position_scale=np.array([1.6, 1.1, 1.6])), survey)
+    assert "positions scatter" not in found
 
 
 def test_heights_that_drift_are_reported(adjusted: Adjusted, survey: Simulated) -> None:
     xyz = survey.reference.xyz_m.copy()
     xyz[:, 2] += np.linspace(0, 80, 12)
-    text = _findings(adjusted, survey, replace(survey.reference, xyz_m=xyz))
-    assert "Measured heights drift against the photos by 80" in text
+    found = _findings(adjusted, survey, replace(survey.reference, xyz_m=xyz))["heights drift"]
+    assert found["drift_m"] == pytest.approx(80.0, abs=0.5) and found["share"] > 0.99  # heights have 0.06 m
 
 
 def test_heights_that_are_not_used_are_reported(adjusted: Adjusted, survey: Simulated) -> None:
     std = survey.reference.std_m.copy()
     std[:, 2] = np.inf
-    assert "No measured height is used" in _findings(adjusted, survey, replace(survey.reference, std_m=std))
+    assert _findings(adjusted, survey, replace(survey.reference, std_m=std))["no heights"] == {}
 
 
 def test_parameters_at_a_bound_and_far_from_the_photos_are_reported(adjusted: Adjusted, survey: Simulated) -> None:
     parameters = adjusted.block.camera_parameters.copy()
     parameters[0, [0, 2, 4]] *= [1.2, 1.1, 0.0]
     parameters[0, 4] = -0.5
-    text = _findings(_with_block(adjusted, camera_parameters=parameters), survey)
-    assert "k1 is at its bound (-0.5, allowed -0.5 to 0.5)" in text
-    assert "fx moved from" in text and "principal point's cx" in text
+    found = _findings(_with_block(adjusted, camera_parameters=parameters), survey)
+    bound, focal, center = (found[kind] for kind in ("at bound", "focal moved", "principal point off"))
+    assert bound == {"camera": "camera 0", "parameter": "k1", "value": -0.5, "low": -0.5, "high": 0.5}
+    assert (focal["parameter"], focal["value"]) == ("fx", parameters[0, 0])
+    assert focal["before"] == survey.block.camera_parameters[0, 0]
+    assert (center["parameter"], center["value"]) == ("cx", parameters[0, 2])
+    assert center["middle"] == survey.photos[0].width_px / 2
 
 
 def test_images_with_few_points_are_named(adjusted: Adjusted, survey: Simulated) -> None:
@@ -124,8 +140,8 @@ def test_images_with_few_points_are_named(adjusted: Adjusted, survey: Simulated)
     keep[first] = False
     changes = {name: getattr(block, name)[keep] for name in
                ("observation_image", "observation_point", "observation_xy_px")}  # fmt: skip
-    text = _findings(_with_block(adjusted, **changes), survey)
-    assert "1 image with fewer than 20 points" in text and "DJI_0002.JPG (7 points)" in text
+    found = _findings(_with_block(adjusted, **changes), survey)["few points"]
+    assert found == {"names": ["DJI_0002.JPG"], "points": [7], "least": 20}
 
 
 def test_what_the_rounds_left_out_is_told(adjusted: Adjusted, survey: Simulated) -> None:
@@ -134,14 +150,14 @@ def test_what_the_rounds_left_out_is_told(adjusted: Adjusted, survey: Simulated)
         pruned=(LeftOut(name="a.jpg, b.jpg", reason="their 60 matches are off by 5.1 px"),),
         lost=(LeftOut(name="c.jpg", reason="fewer than 3 of its features fit"),),
     )
-    text = _findings(left, survey)
-    assert "Edge left out: a.jpg, b.jpg: their 60 matches" in text
-    assert "Image lost in the adjustment: c.jpg: fewer than 3" in text
+    found = _findings(left, survey)
+    assert found["edge left out"] == {"name": "a.jpg, b.jpg", "reason": "their 60 matches are off by 5.1 px"}
+    assert found["image lost"] == {"name": "c.jpg", "reason": "fewer than 3 of its features fit"}
 
 
 def test_sigmas_of_a_single_receiver_are_explained(adjusted: Adjusted, survey: Simulated) -> None:
     plain = replace(survey.reference, std_m=np.full((12, 3), 3.0))
-    assert "up to their own sigma of 3.0 m horizontally" in _findings(adjusted, survey, plain)
+    assert _findings(adjusted, survey, plain)["common offset"] == {"median_m": 0.02, "receiver_std_m": 3.0}
 
 
 def test_position_sigmas_are_those_of_the_axes_that_were_measured(adjusted: Adjusted, survey: Simulated) -> None:
@@ -153,5 +169,5 @@ def test_position_sigmas_are_those_of_the_axes_that_were_measured(adjusted: Adju
         1.0,
     )
     fit = gnss_fit(adjusted.block, without_heights)
-    text = "\n".join(sentences(findings(adjusted, survey.block, sigmas, fit, without_heights, survey.photos)))
-    assert "Position sigmas (median 0.03 m)" in text and "nan" not in text
+    found = _by_kind(findings(adjusted, survey.block, sigmas, fit, without_heights, survey.photos))
+    assert found["common offset"] == {"median_m": 0.03, "receiver_std_m": 3.0} and "nan" not in str(found)

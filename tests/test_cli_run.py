@@ -102,14 +102,10 @@ def test_a_bad_folder_is_one_line_and_exit_code_2(cli: Cli, tmp_path: Path, name
 @pytest.mark.slow
 def test_ctrl_c_ends_with_130_and_the_next_run_goes_on(cli: Cli, photos: Path, tmp_path: Path):
     arguments = ["run", photos, "--out", tmp_path / "project", *FLAGS, "--stage", "features", "--workers", "1"]
-    command = [sys.executable, "-m", "jaxba", *map(str, arguments)]
-    process = subprocess.Popen(
-        command,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # which a shell's background job ignores
-    )
+    # as `python -m jaxba` does it from a terminal; a shell's background job ignores Ctrl-C, and what it starts
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from jaxba.cli import main; main()"
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     until = time.monotonic() + 120
     features = tmp_path / "project" / "stages" / "features"
     while time.monotonic() < until and not list(features.glob("*/record.json")):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxba.sfm._rotations import average_rotations
+from jaxba.sfm._rotations import _from_tree, average_rotations
 
 
 def edges(
@@ -32,6 +32,14 @@ def test_exact_relative_rotations_give_exact_rotations() -> None:
     found, used, error = average_rotations(20, pairs, quaternion, np.ones(len(pairs)), max_error_rad=0.1)
     assert used.all()
     assert error.max() < 1e-7 and angles(found, true).max() < 1e-7  # rounding of arccos near 1
+
+
+def test_start_values_are_chained_along_edges_in_both_directions() -> None:
+    """The averaging after them would mend a start that is wrong in one of the two, where edges are good."""
+    true, pairs, quaternion, _ = edges(20, np.random.default_rng(0), noise_rad=0.0, wrong=0.0)
+    relative, weight = Rotation.from_quat(quaternion, scalar_first=True), 1.0 / (1 + np.abs(pairs.mean(axis=1) - 10))
+    found = _from_tree(20, pairs, relative, weight, np.ones(20, bool)).as_quat(scalar_first=True)
+    assert angles(found, true).max() < 1e-7  # rounding of arccos near 1
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -87,13 +87,16 @@ def test_a_log_has_plain_lines_and_not_too_many(capsys: pytest.CaptureFixture[st
     show = LogLines(clock)
     show(Event("begin", "features"))
     show(Event("todo", "features", 0, 1000, by_photos=True))
-    said: list[float] = []
+    begins, said = capsys.readouterr().err, dict[float, str]()
     for done in range(1, 1001):  # 500 s, and a tenth of the photos each 50 s
         clock.now += 0.5
         show(photo(done, 1000))
         if lines := capsys.readouterr().err:
-            said.append(clock.now)
-    assert said and len(said) <= 11 and min(b - a for a, b in pairwise(said)) >= 10
+            said[clock.now] = lines
+    assert begins == "features  begins, 1000 photos\n" and len(said) == 9
+    assert all(49 < b - a < 52 for a, b in pairwise([100.0, *said]))
+    assert said[150.0] == "features  100 of 1000 photos, 2.0 photos a second, 7 min left\n"
+    assert all(line.startswith("features  ") and line.count("\n") == 1 for line in said.values())
     show(photo(500, 1000))
     show(Event("begin", "adjust"))
     show(Event("todo", "adjust", 0, 1))
@@ -133,9 +136,16 @@ def test_json_events_have_the_fields_that_are_documented(capsys: pytest.CaptureF
     assert events[-2]["eta_s"] == pytest.approx(6.0) and events[-2]["share"] == 0.625
     assert events[-1] | {"time": ""} == {"time": "", "event": "step", "stage": "features", "text": "at work"}
     documented = progress.__doc__ or ""
+    left = LeftOut(name="a.jpg", reason="cut short")
+    show(Event("end", "features", 8, 8, seconds=10.0, left_out=(left,), lines=("8 photos",)))
+    events.append(json.loads(capsys.readouterr().err))
+    assert events[-1] | {"time": ""} == {
+        "time": "", "event": "stage_end", "stage": "features", "total": 8, "seconds": 10.0, "lines": ["8 photos"],
+        "left_out": [{"name": "a.jpg", "reason": "cut short"}],
+    }  # fmt: skip
     for event in events:
-        row = documented[documented.index(f"| `{event['event']}` |") :]
-        assert all(f"`{field}`" in row for field in event.keys() - {"time", "event"})
+        row = documented[documented.index(f"| `{event['event']}` |") :].partition("\n| `")[0]  # to the next event's
+        assert all(f"`{field}`" in row for field in event.keys() - {"time", "event"}), event["event"]
 
 
 def test_steps_are_told_while_the_block_runs_and_no_longer():

@@ -135,6 +135,11 @@ def test_every_check_above_found_something():
     assert {"run", "simulate", "status", "verify", "diagnose", "config", "solve", "gradcheck"} <= used
     assert {"benchmarks.run", "benchmarks.memory", "benchmarks.gradients", "benchmarks.truth"} <= used
     assert len(set(_BENCHMARK.findall(text))) >= 10 and {"--gcp", "--crs", "--set"} <= options_of("run")
+    links = [link for link in _LINK.findall(text) if "://" not in link]
+    assert len(links) > 50 and sum("#" in link for link in links) > 20
+    assert sum(language == "python" for language, _ in _FENCE.findall(text)) >= 3
+    bare = _FENCE.sub("", text)
+    assert {"--gcp", "--set"} <= {option for span in re.findall(r"`([^`]+)`", bare) for option in _OPTION.findall(span)}
 
 
 def test_the_example_of_a_stage_runs(monkeypatch: pytest.MonkeyPatch):

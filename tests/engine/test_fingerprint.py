@@ -69,6 +69,8 @@ def test_code_version_differs_by_stage_and_repeats():
     names = ["metadata", "crs", "control", "pairs", "features", "match", "tracks", "start", "adjust", "export"]
     versions = [code_version(f"jaxba.pipeline.{name}") for name in names]
     assert len(set(versions)) == len(names)
+    forget()
+    assert [code_version(f"jaxba.pipeline.{name}") for name in names] == versions
 
 
 def test_code_version_changes_with_what_is_imported(monkeypatch, tmp_path):

@@ -67,7 +67,9 @@ def test_record_tells_key_and_contents(tmp_path, made):
     second = save(tmp_path / "b", made, TWO)
     moved = dataclasses.replace(made.photos[0], path=tmp_path / "elsewhere" / "b.jpg")
     third = save(tmp_path / "c", dataclasses.replace(made, photos=(moved,)), TWO)
-    fourth = save(tmp_path / "d", dataclasses.replace(made, points=made.points + 1e-16 + 1), TWO)
+    nudged = made.points.copy()
+    nudged[4, 2] = np.nextafter(nudged[4, 2], np.inf)
+    fourth = save(tmp_path / "d", dataclasses.replace(made, points=nudged), TWO)
     assert read_record(tmp_path / "a") == first and first.key == ONE
     assert first.digest == second.digest == third.digest != fourth.digest
 

@@ -1,9 +1,12 @@
 """The adjust stage: its outputs fit together, and its parameters reach the rounds."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from simulated import Simulated, simulate
 
+from jaxba import sfm
 from jaxba.pipeline import adjust
 from jaxba.pipeline.adjust import Inputs, Outputs, Params
 
@@ -44,6 +47,32 @@ def test_the_block_is_where_it_was_flown(outputs: Outputs, simulated: Simulated)
     np.testing.assert_allclose(outputs.gnss_residual_m, outputs.block.centers_m - simulated.reference.xyz_m, atol=1e-12)
     assert np.isfinite(outputs.position_std_m).all() and np.isfinite(outputs.point_std_m).all()
     assert 0.005 < np.median(outputs.position_std_m) < 0.06  # GNSS of 3 to 6 cm
+
+
+def test_every_parameter_reaches_the_rounds(simulated: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Reached(Exception):
+        pass
+
+    def stop(*given: object) -> None:
+        raise Reached(next(value for value in given if isinstance(value, sfm.Settings)))
+
+    changed = {
+        "loss": "cauchy", "f_scale": 2.0, "max_nfev": 123, "ftol": 1e-9, "xtol": 1e-10, "track_threshold": 3.0,
+        "mad_factor": 3.5, "max_rounds": 7, "complete_radius": 6.0, "edge_median_limit": 4.0,
+    }  # fmt: skip
+    assert {field.name for field in fields(Params)} == {*changed, "min_angle"}
+    monkeypatch.setattr(sfm, "adjust", stop)
+    inputs = Inputs(
+        photos=simulated.photos,
+        reference=simulated.reference,
+        view_graph=simulated.view_graph,
+        tracks=simulated.tracks,
+        block=simulated.block,
+    )
+    with pytest.raises(Reached) as reached:
+        adjust.run(inputs, Params(**changed, min_angle=3.0))
+    settings = vars(reached.value.args[0])
+    assert settings == changed | {"min_angle_rad": pytest.approx(np.pi / 60)}
 
 
 def test_parameters_out_of_range_are_refused() -> None:

@@ -78,7 +78,8 @@ def test_each_bad_file_is_named_with_its_reason_and_the_rest_goes_on(mixed: tupl
     expected = {
         "photo 2.JPG": ("metadata", "same file as copy.jpg"),
         "cut.jpg": ("features", "cannot be decoded (image file is truncated"), "black.jpg": ("features", "no texture"),
-        "text.jpg": ("metadata", ""), "empty.jpg": ("metadata", ""), "raw.DNG": ("metadata", "RAW"),
+        "text.jpg": ("metadata", "is no image that can be read (8 bytes)"),
+        "empty.jpg": ("metadata", "is no image that can be read (it is empty)"), "raw.DNG": ("metadata", "RAW"),
     }  # fmt: skip
     assert set(reasons) == set(expected)
     for name, (stage, words) in expected.items():

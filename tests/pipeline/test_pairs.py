@@ -129,6 +129,7 @@ def test_positions_off_by_more_than_a_tenth_of_the_footprint_widen_the_search():
     outputs = pairs.run(flight.inputs, pairs.Params())
     missed = overlapping - found(outputs)
     assert len(missed) < 0.02 * len(overlapping)
+    assert len(outputs.pairs) < 0.1 * outputs.num_all
     blind = dataclasses.replace(
         flight.inputs, reference=dataclasses.replace(flight.inputs.reference, std_m=np.full((300, 3), 0.05))
     )
@@ -153,6 +154,7 @@ def test_heights_unknown_pair_the_nearest_photos():
     outputs = pairs.run(dataclasses.replace(flight.inputs, reference=reference), pairs.Params())
     assert outputs.method == "neighbours"
     assert np.isnan(outputs.overlap).all()
+    assert len(outputs.pairs) <= 20 * 400 < 0.11 * outputs.num_all
     assert "heights above ground are unknown" in outputs.notes[0]
     overlapping = {pair for pair, share in flight.true_overlap.items() if share > 0.3}
     assert len(overlapping - found(outputs)) < 0.01 * len(overlapping)
@@ -172,6 +174,7 @@ def test_heights_that_cannot_be_right_are_named_and_neighbours_paired():
     reference = dataclasses.replace(flight.inputs.reference, height_above_ground_m=np.full(200, 25.0))
     outputs = pairs.run(dataclasses.replace(flight.inputs, reference=reference), pairs.Params())
     assert "doubtful" in outputs.notes[1]
+    assert len(outputs.pairs) < 0.15 * outputs.num_all
     overlapping = {pair for pair, share in flight.true_overlap.items() if share > 0.5}
     assert len(overlapping - found(outputs)) < 0.01 * len(overlapping)
 

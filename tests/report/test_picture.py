@@ -61,7 +61,12 @@ def test_points_have_their_colour_and_the_flight_is_drawn():
     ids=["no cameras", "no errors", "no place", "flat", "an outlier", "narrow"],
 )
 def test_odd_clouds_are_drawn_too(changes: dict):
-    assert pixels(draw_picture(replace(picture(), **changes))).shape == (900, 1600, 3)
+    shown = pixels(draw_picture(replace(picture(), **changes)))
+    assert shown.shape == (900, 1600, 3)
+    has_points, has_flight = (
+        (np.abs(shown[:, :1010] - colour).max(axis=2) < 60).any() for colour in ([0, 160, 0], [255, 90, 54])
+    )
+    assert has_points and has_flight == ("camera_xyz" not in changes)
 
 
 def test_outlier_does_not_shrink_the_picture():

@@ -23,7 +23,7 @@ import equinox as eqx
 import numpy as np
 from jax import Array
 from jax.core import Tracer
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial.transform import Rotation
@@ -103,6 +103,8 @@ class Plan(eqx.Module):
     """Original index of the observation in each row, -1 for padding."""
     row_image: Int[Array | np.ndarray, " rows"]
     row_point: Int[Array | np.ndarray, " rows"]
+    point_image: Int[Array | np.ndarray, " padded_points"]
+    """The first image that sees each point; both in solver order, padding included."""
     pair_first: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
     pair_second: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
     """Rows of each pair; the first one's image comes later in the order. Padding is the last row, of weight zero."""
@@ -186,6 +188,7 @@ def make_plan(
         row_observation=row_observation,
         row_image=row_image,
         row_point=row_point,
+        point_image=_first_images(row_image, row_point, row_observation >= 0, num_points),
         pair_first=runs.first,
         pair_second=runs.second,
         pair_block=runs.block_of_run,
@@ -300,6 +303,19 @@ def _layout_rows(
     row_image = np.full(num_rows, padding_image, np.int32)
     row_image[: starts[-1]] = np.repeat(np.arange(num_images, dtype=np.int32), padded)
     return row_observation, row_image
+
+
+def _first_images(
+    row_image: Int[np.ndarray, " rows"],
+    row_point: Int[np.ndarray, " rows"],
+    seen: Bool[np.ndarray, " rows"],
+    count: int,
+) -> Int[np.ndarray, " count"]:
+    """Return the first image that sees each point, 0 where none does."""
+    first = np.zeros(count, np.int32)
+    rows = np.flatnonzero(seen)[::-1]  # images ascend with the rows, and the last one written stays
+    first[row_point[rows]] = row_image[rows]
+    return first
 
 
 def _pairs(

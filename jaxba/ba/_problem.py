@@ -38,10 +38,13 @@ class AbstractPrior(eqx.Module):
     """A residual group beside the reprojections: a class of your own, or one of those in `ba/groups`.
 
     `name` is the group's name in files, tables and messages. `loss` is applied to the squared norm of each row's
-    residual, which is already divided by its sigmas.
+    residual, which is already divided by its sigmas. `in_world` names the fields with coordinates of the world, which a
+    solve counts from the middle of a block that lies far from the origin; None, for a class that does not say, keeps
+    the coordinates of all as they are.
     """
 
     name: ClassVar[str]
+    in_world: ClassVar[tuple[str, ...] | None] = None
     loss: eqx.AbstractVar[AbstractLoss]
 
     @abc.abstractmethod

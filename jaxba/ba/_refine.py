@@ -18,6 +18,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.ba._linearise import point_costs, point_equations
+from jaxba.ba._rows import rows_of
 from jaxba.ba._schur import solve_points
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Unknowns
@@ -25,6 +26,7 @@ from jaxba.geometry import Linear
 
 _NEAR_BEND = 0.9
 _SWEEPS, _ROBUST_SWEEPS = 2, 6
+_OUTWARD = 10.0
 
 
 def refine_points(
@@ -45,7 +47,7 @@ def refine_points(
         unknowns, costs, damping = state
         gradient, hessian = point_equations(system, unknowns, bend)
         step = -solve_points(system, hessian, gradient, damping)
-        moved = _with_points(unknowns, unknowns.points + step)
+        moved = _with_points(unknowns, move_points(system, unknowns, step))
         moved_costs = point_costs(system, moved)
         better = moved_costs < costs
         points = jnp.where(better[:, None], moved.points, unknowns.points)
@@ -55,6 +57,25 @@ def refine_points(
     start = (trial, costs, jnp.full(costs.shape, 1e-4, costs.dtype))
     refined = jax.lax.scan(sweep, start, length=_SWEEPS if isinstance(system.loss, Linear) else _ROBUST_SWEEPS)[0][0]
     return refined, jnp.sum(lost)
+
+
+def move_points(
+    system: System, unknowns: Unknowns, step: Float[Array | np.ndarray, "points 3"]
+) -> Float[Array, "points 3"]:
+    """Return the points after a step: across the ray from the first camera that sees each by addition, along it in
+    inverse distance.
+
+    To first order this is `points + step`. But what a camera sees of a far point is nearly linear in its inverse
+    distance and far from linear in its distance ("inverse depth", Montiel et al. 2006): a step that would take the
+    point behind the camera halves or thirds its distance, and none multiplies it by more than `_OUTWARD`.
+    """
+    origin = rows_of(unknowns.poses.center, system.point_image)
+    ray = unknowns.points - origin
+    along = jnp.sum(ray * step, axis=1) / jnp.maximum(jnp.sum(ray**2, axis=1), jnp.finfo(ray.dtype).tiny)
+    across = step - along[:, None] * ray
+    limited = jnp.minimum(along, 1 - 1 / _OUTWARD)
+    growth = (limited / (1 - limited))[:, None]  # by which the distance grows
+    return jnp.asarray(unknowns.points) + growth * ray + (1 + growth) * across
 
 
 def _with_points(unknowns: Unknowns, points: Float[Array | np.ndarray, "points 3"]) -> Unknowns:

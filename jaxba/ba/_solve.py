@@ -21,7 +21,16 @@ from jaxba.ba._plan import LinearSolver, Plan
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solvers import AbstractSchurSolver, SchurDogleg, SchurLevenbergMarquardt
-from jaxba.ba._system import System, initial_unknowns, is_traced, make_system, restore, structured
+from jaxba.ba._system import (
+    System,
+    centred,
+    from_centred,
+    initial_unknowns,
+    is_traced,
+    make_system,
+    restore,
+    structured,
+)
 from jaxba.ba._traced import solve_traced
 from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractLoss, Linear
@@ -98,8 +107,9 @@ def _solve_on_host(
     begun = time.perf_counter()
     prepared, plan = structured(problem, plan, linear_solver)
     problem = prepared.problem
-    system: System = jax.device_put(make_system(problem, plan, loss, dtype))
-    start: Unknowns = jax.device_put(initial_unknowns(problem, plan, dtype))
+    near, origin = centred(problem)
+    system: System = jax.device_put(make_system(near, plan, loss, dtype))
+    start: Unknowns = jax.device_put(initial_unknowns(near, plan, dtype))
     seconds_setup = time.perf_counter() - begun
     reached = descend(solver, start, system, max_nfev, callback)
     report = Report(
@@ -116,4 +126,5 @@ def _solve_on_host(
     costs = reached.history[0].cost, reached.state.cost, plain(start), plain(reached.unknowns)
     on_host = jax.tree.map(np.asarray, (reached.unknowns, costs, reached.state.status, reached.state.num_steps))
     unknowns, costs, status, num_steps = on_host
-    return Solution.of(problem, restore(unknowns, problem, plan), costs, status, num_steps, report)
+    values = from_centred(restore(unknowns, problem, plan), origin)
+    return Solution.of(problem, values, costs, status, num_steps, report)

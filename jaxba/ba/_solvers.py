@@ -24,7 +24,8 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxba.ba._factor import solve_reduced
 from jaxba.ba._linearise import Linearisation, cost, curvature, linearise
-from jaxba.ba._refine import refine_points
+from jaxba.ba._refine import move_points, refine_points
+from jaxba.ba._rows import rows_of
 from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, reduce_vector, to_reduced
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
@@ -60,10 +61,11 @@ class State(eqx.Module):
 
 
 class Proposal(NamedTuple):
-    """A step, and the number of linear iterations it took."""
+    """A step, the number of linear iterations it took, and how many times as long it would be with full trust."""
 
     step: Step
     linear_iterations: Int[Array, ""]
+    shortened: Float[Array, ""]
 
 
 def residuals(unknowns: Unknowns, system: System) -> tuple[Float[Array, "components *rows"], ...]:
@@ -128,10 +130,11 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
         system = args
         model = linearise(system, y, state.bend)
         gradient_norm = _projected_gradient_norm(system, y, model.gradient)
-        step, linear_iterations = self.propose(system, y, model, state.trust)
+        step, linear_iterations, shortened = self.propose(system, y, model, state.trust)
         step = _within_bounds(system, y, step)
         promised = -_slope(model.gradient, step) - curvature(system, model, step) / 2
-        trial, points_held = refine_points(system, y.retract(step), y, state.bend > 0)
+        moved = eqx.tree_at(lambda u: u.points, y.retract(step), move_points(system, y, step.points))
+        trial, points_held = refine_points(system, moved, y, state.bend > 0)
         trial_cost = cost(system, trial)
         finite = jnp.isfinite(promised) & jnp.isfinite(trial_cost)
         change = jnp.where(finite, state.cost - trial_cost, -jnp.inf)
@@ -140,9 +143,10 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
         accepted = (ratio > _MIN_RATIO) & ~at_optimum
         trust, factor = self.adapt(state, ratio, _scaled_norm(step, model.diagonal))
 
-        step_norm, size = _norm(step), _size(y)
-        small = finite & (promised <= self.rtol * state.cost) & (jnp.abs(change) <= self.rtol * state.cost)
-        short = finite & (step_norm <= self.xtol * (self.xtol + size))
+        # what little trust leaves of a step says nothing about the way to the optimum
+        small = finite & (shortened * promised <= self.rtol * state.cost) & (jnp.abs(change) <= self.rtol * state.cost)
+        turn = shortened * _length(model, step)
+        short = finite & (turn <= self.xtol * (self.xtol + _length_of_all(system, y, model)))
         status = jnp.where(self._exhausted(trust), STUCK, RUNNING)
         status = jnp.where(short, XTOL, status)
         status = jnp.where(small, FTOL, status)
@@ -155,7 +159,7 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
             cost=jnp.where(accepted, trial_cost, state.cost),
             change=jnp.where(accepted, change, 0.0),
             gradient_norm=gradient_norm,
-            step_norm=step_norm,
+            step_norm=_norm(step),
             linear_iterations=linear_iterations,
             points_held=points_held,
             accepted=accepted,
@@ -226,7 +230,7 @@ class SchurDogleg(AbstractSchurSolver):
     initial_trust: float = 1e4
 
     def propose(self, system: System, unknowns: Unknowns, model: Linearisation, trust: Float[Array, ""]) -> Proposal:
-        newton, linear_iterations = _damped_step(system, unknowns, model, jnp.asarray(1e-10, trust.dtype))
+        newton, linear_iterations, _ = _damped_step(system, unknowns, model, jnp.asarray(1e-10, trust.dtype))
         finite = jnp.isfinite(_norm(newton))
         scale = _scale(model.diagonal)
         descent = jax.tree.map(lambda g, d, free: -free * g / d, model.gradient, scale, system.free)
@@ -247,7 +251,9 @@ class SchurDogleg(AbstractSchurSolver):
         root = jnp.sqrt(jnp.maximum(b**2 - a * c, 0.0))
         t = jnp.where(a > 0, -jnp.minimum(c, 0.0) / jnp.maximum(b + root, jnp.finfo(a.dtype).tiny), 1.0)
         t = jnp.clip(t, 0.0, 1.0)
-        return Proposal(jax.tree.map(lambda c, d: c + t * d, cauchy, leg), linear_iterations)
+        step = jax.tree.map(lambda c, d: c + t * d, cauchy, leg)
+        full, length = _scaled_norm(newton, model.diagonal), _scaled_norm(step, model.diagonal)
+        return Proposal(step, linear_iterations, jnp.where(length > 0, jnp.maximum(full / length, 1.0), 1.0))
 
     def adapt(self, state: State, ratio: Float[Array, ""], scaled_norm: Float[Array, ""]) -> tuple[Array, Array]:
         good = ratio > _MIN_RATIO
@@ -260,13 +266,20 @@ class SchurDogleg(AbstractSchurSolver):
 
 
 def _damped_step(system: System, unknowns: Unknowns, model: Linearisation, damping: Float[Array, ""]) -> Proposal:
-    """Return the minimiser of the model plus `damping * d^T diag(J^T J) d / 2`, the border within its bounds."""
+    """Return the minimiser of the model plus `damping * d^T D d / 2`, the border within its bounds.
+
+    D is the diagonal of J^T J for all but the points, and their own 3x3 blocks for these: axes of the world are not the
+    ones in which a point is known, and along the ray of a far point the diagonal would outweigh what its images tell.
+    """
     scaled = jax.tree.map(lambda d: damping * d, _scale(model.diagonal))
-    reduced = eliminate_points(system, model, scaled)
+    unseen = jnp.where(model.diagonal.points > 0, 0.0, 1.0)
+    scaled = eqx.tree_at(lambda s: s.points, scaled, unseen)
+    damped = eqx.tree_at(lambda m: m.point_products, model, (1 + damping) * model.point_products)
+    reduced = eliminate_points(system, damped, scaled)
     rhs = jax.tree.map(lambda g: -g, model.gradient)
     lower, upper = _step_bounds(system, unknowns)
     solved = solve_reduced(system, reduced, reduce_vector(system, reduced, rhs), lower, upper)
-    return Proposal(back_substitute(system, reduced, rhs, solved.vector), solved.iterations)
+    return Proposal(back_substitute(system, reduced, rhs, solved.vector), solved.iterations, 1 + damping)
 
 
 def _step_bounds(system: System, unknowns: Unknowns) -> tuple[Array | None, Array | None]:
@@ -334,6 +347,20 @@ def _scaled_norm(step: Step, diagonal: Step) -> Float[Array, ""]:
     return jnp.sqrt(_total(jax.tree.map(lambda s, d: jnp.sum(s**2 * d), step, scale)))
 
 
-def _size(unknowns: Unknowns) -> Float[Array, ""]:
-    values = (unknowns.poses.translation, unknowns.intrinsics, unknowns.lever_arm, unknowns.points)
-    return jnp.sqrt(_total([jnp.sum(v**2) for v in values]))
+def _length(model: Linearisation, step: Step) -> Float[Array, ""]:
+    """Length of a step in what its unknowns are known to, each by itself: in sigmas, if all others were fixed."""
+    blocks = (step.poses, model.diagonal.poses), (step.intrinsics, model.diagonal.intrinsics)
+    total = _total([jnp.sum(s**2 * d) for s, d in (*blocks, (step.lever_arm, model.diagonal.lever_arm))])
+    return jnp.sqrt(total + jnp.einsum("pi,pij,pj->", step.points, model.point_products, step.points))
+
+
+def _length_of_all(system: System, unknowns: Unknowns, model: Linearisation) -> Float[Array, ""]:
+    """The same of a step as long as the unknowns: a turn of one radian, the way from camera to point, all intrinsics.
+
+    `xtol` of it moves what the images see by about `xtol` radian. It depends neither on the origin of the world nor on
+    its unit, and a point at infinity adds to it what others do.
+    """
+    ray = unknowns.points - rows_of(unknowns.poses.center, system.point_image)
+    of_points = jnp.sum(ray**2, axis=1) * jnp.trace(model.point_products, axis1=1, axis2=2)
+    of_intrinsics = jnp.sum(unknowns.intrinsics**2 * model.diagonal.intrinsics)
+    return jnp.sqrt(jnp.sum(of_points) + of_intrinsics + jnp.sum(model.diagonal.poses[:, :3]))

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from jaxba.ba._check import Prepared, prepare
 from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, PlanShape, bucket, make_plan
@@ -29,7 +30,7 @@ class System(eqx.Module):
 
     - `free`: 1 where an unknown may change, 0 where it is fixed or padding.
     - `lower`, `upper`: bounds on the intrinsics.
-    - `pair_*`, `block_*`: see `Plan`.
+    - `point_image`, `pair_*`, `block_*`: see `Plan`.
     """
 
     reprojection: Reprojection
@@ -38,6 +39,7 @@ class System(eqx.Module):
     free: Step
     lower: Float[Array | np.ndarray, "cameras parameters"]
     upper: Float[Array | np.ndarray, "cameras parameters"]
+    point_image: Int[Array | np.ndarray, " points"]
     pair_first: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
     pair_second: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
     pair_block: Int[Array | np.ndarray, " pair_runs"]
@@ -57,6 +59,26 @@ def structured(problem: Problem, plan: Plan | None, linear_solver: LinearSolver)
         like = None if plan is None else plan.shape
         plan = make_plan(prepared.problem, linear_solver=linear_solver, like=like)
     return prepared, plan
+
+
+def centred(problem: Problem) -> tuple[Problem, Float[np.ndarray, "3"]]:
+    """Return the problem in coordinates about the middle of its cameras, and where that lies, in whole metres.
+
+    The coordinates stay where the middle is no further from the origin than the block is wide. Far from it, float64
+    holds a position of 4.6e6 m to 1e-9 m, and the noise of that in the cost hides the last steps to the optimum.
+    """
+    rotation = Rotation.from_quat(np.array(problem.poses.quaternion, float), scalar_first=True)
+    centers = -rotation.apply(np.array(problem.poses.translation, float), inverse=True)
+    origin = np.round(np.median(centers, axis=0))
+    if np.abs(origin).max() <= np.ptp(centers, axis=0).max() or any(p.in_world is None for p in problem.priors):
+        return problem, np.zeros(3)
+
+    def moved(prior: AbstractPrior) -> AbstractPrior:
+        return dataclasses.replace(prior, **{name: getattr(prior, name) - origin for name in prior.in_world or ()})
+
+    poses = Pose(problem.poses.quaternion, problem.poses.translation + rotation.apply(origin))
+    near = poses, problem.points - origin, tuple(moved(prior) for prior in problem.priors)
+    return eqx.tree_at(lambda p: (p.poses, p.points, p.priors), problem, near), origin
 
 
 def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = np.float64) -> System:
@@ -92,6 +114,7 @@ def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = n
         free=free,
         lower=_padded(xp, problem.lower, plan.camera_order, shape.num_cameras, -np.inf, dtype),
         upper=_padded(xp, problem.upper, plan.camera_order, shape.num_cameras, np.inf, dtype),
+        point_image=plan.point_image,
         pair_first=plan.pair_first,
         pair_second=plan.pair_second,
         pair_block=plan.pair_block,
@@ -135,6 +158,16 @@ def restore(unknowns: Unknowns, problem: Problem, plan: Plan) -> Unknowns:
         lever_arm=xp.asarray(unknowns.lever_arm),
         points=xp.asarray(unknowns.points)[point_rank],
     )
+
+
+def from_centred(unknowns: Unknowns, origin: Float[np.ndarray, "3"]) -> Unknowns:
+    """Return unknowns that count from `origin` in coordinates of the world."""
+    if not origin.any():
+        return unknowns
+    rotation = Rotation.from_quat(np.array(unknowns.poses.quaternion, float), scalar_first=True)
+    translation = unknowns.poses.translation - rotation.apply(origin)
+    world = Pose(unknowns.poses.quaternion, translation), unknowns.points + origin
+    return eqx.tree_at(lambda u: (u.poses, u.points), unknowns, world)
 
 
 def without_losses(system: System) -> System:

@@ -7,10 +7,11 @@ import jax
 import numpy as np
 import pytest
 from quick_jit import quick_jit
+from scipy.spatial.transform import Rotation
 from small_problems import RADIAL, bounded, small_problem
 
 import jaxba
-from jaxba.ba import HistoryStep
+from jaxba.ba import HistoryStep, Observations
 
 # one problem, with an optimum at bounds, and one loss, so that most solves share one program
 PROBLEM = bounded(small_problem(RADIAL, num_outliers=3), 0.01)
@@ -73,6 +74,52 @@ def test_vmap_over_pixels_equals_one_solve_each() -> None:
     np.testing.assert_allclose(together, np.stack(alone), rtol=1e-9)
 
 
+@pytest.mark.parametrize("offset", [(5e5, 4.6e6, 300.0), (-3e3, 0.0, 0.0), (1e9, -1e9, 1e9)])
+def test_the_origin_of_the_world_does_not_change_the_answer(offset: tuple[float, float, float]) -> None:
+    here = jaxba.solve(PROBLEM, loss=LOSS)
+    there = jaxba.solve(moved(PROBLEM, np.array(offset)), loss=LOSS)
+    # of each coordinate given, times what the geometry makes of it, beside what convergence leaves in weak directions
+    rounding = 64 * np.spacing(np.abs(offset).max()) + 1e-9
+    assert there.result == here.result
+    assert there.num_steps == here.num_steps
+    np.testing.assert_allclose(there.final_cost, here.final_cost, rtol=1e-9 + 100 * rounding)
+    np.testing.assert_allclose(there.points - offset, here.points, rtol=0, atol=rounding)
+    np.testing.assert_allclose(np.asarray(there.poses.center) - offset, here.poses.center, rtol=0, atol=rounding)
+
+
+def test_a_group_that_says_nothing_of_the_world_keeps_its_coordinates() -> None:
+    class OwnPosition(jaxba.PositionPrior):
+        in_world = None
+
+    position = PROBLEM.prior("position")
+    own = OwnPosition(position.image_index, position.xyz + 1e4, position.std_m)
+    problem = eqx.tree_at(lambda p: p.priors, moved(PROBLEM, np.full(3, 1e4)), (own, *PROBLEM.priors[1:2]))
+    assert jaxba.solve(problem, loss=LOSS).final_cost < 1e3
+
+
+@pytest.mark.parametrize("method", ["lm", "dogleg"])
+@pytest.mark.parametrize("distance_m", [1e3, 1e6, 1e9])
+@pytest.mark.parametrize("times", [1.0, 3.0])
+def test_far_points_do_not_hold_up_the_others(method: str, distance_m: float, times: float) -> None:
+    near = jaxba.solve(PROBLEM, method=method, loss=LOSS)
+    problem = with_far_points(PROBLEM, distance_m, times)
+    far = jaxba.solve(problem, method=method, loss=LOSS)
+    assert far.converged
+    assert far.num_steps <= near.num_steps + 15
+    points = np.concatenate([near.points, problem.points[problem.num_points - 4 :]])
+    elsewhere = eqx.tree_at(lambda p: (p.poses, p.points), problem, (near.poses, points))
+    again = jaxba.solve(elsewhere, method=method, loss=LOSS)
+    np.testing.assert_allclose(far.final_cost, again.final_cost, rtol=1e-6)
+
+
+def test_one_wild_start_value_does_not_end_the_solve() -> None:
+    points = np.array(PROBLEM.points)
+    points[7] *= [1, 1, 0]
+    points[7, 2] = -1e12  # below the cameras, where its rays meet 10 m below them
+    wild = jaxba.solve(eqx.tree_at(lambda p: p.points, PROBLEM, points), loss=LOSS)
+    np.testing.assert_allclose(wild.final_cost, jaxba.solve(PROBLEM, loss=LOSS).final_cost, rtol=1e-7)
+
+
 def test_traced_values_without_a_plan_are_refused_with_the_cure() -> None:
     with pytest.raises(jaxba.JaxbaError, match=r"plan=jaxba\.make_plan"):
         jax.jit(lambda p: jaxba.solve(p).final_cost)(_on_device(PROBLEM))
@@ -133,3 +180,37 @@ def test_float32_comes_near_the_double_precision_cost() -> None:
 def _on_device(problem: jaxba.Problem) -> jaxba.Problem:
     floats, rest = eqx.partition(problem, lambda a: isinstance(a, np.ndarray) and a.dtype.kind == "f")
     return eqx.combine(jax.tree.map(jax.numpy.asarray, floats), rest)
+
+
+def moved(problem: jaxba.Problem, offset: np.ndarray) -> jaxba.Problem:
+    """Return the problem in a world whose coordinates are larger by `offset`."""
+    rotation = Rotation.from_quat(problem.poses.quaternion, scalar_first=True)
+    poses = jaxba.Pose(problem.poses.quaternion, problem.poses.translation - rotation.apply(offset))
+    priors = tuple(eqx.tree_at(lambda q: q.xyz, p, p.xyz + offset) if p.in_world else p for p in problem.priors)
+    return eqx.tree_at(lambda p: (p.poses, p.points, p.priors), problem, (poses, problem.points + offset, priors))
+
+
+def with_far_points(problem: jaxba.Problem, distance_m: float, times: float, count: int = 4) -> jaxba.Problem:
+    """Return the problem with points this far ahead of the first image, whose start values are `times` as far.
+
+    Three images see each. Pixels have 0.3 px of noise, so that the rays of some meet nowhere.
+    """
+    rng = np.random.default_rng(1)
+    rotation = Rotation.from_quat(np.array(problem.poses.quaternion), scalar_first=True)
+    centers = np.asarray(problem.poses.center)
+    ahead = np.column_stack([rng.uniform(-0.1, 0.1, (count, 2)), np.ones(count)])
+    points = centers[0] + distance_m * rotation[0].inv().apply(ahead)
+    image, point = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(count), indexing="ij"))
+    in_cam = rotation[image].apply(points[point] - centers[image])
+    camera = jaxba.Radial(*(float(getattr(problem.cameras, n)[0]) for n in problem.cameras.parameter_names()))
+    xy_px = np.asarray(quick_jit(lambda x: camera.project(x))(in_cam)) + 0.3 * rng.normal(size=(len(image), 2))
+    seen = problem.observations
+    observations = Observations(
+        np.concatenate([seen.xy_px, xy_px]),
+        np.concatenate([seen.std_px, np.full(len(image), 0.5)]),
+        np.concatenate([seen.image_index, image]).astype(np.int32),
+        np.concatenate([seen.point_index, problem.num_points + point]).astype(np.int32),
+    )
+    start = np.concatenate([problem.points, centers[0] + times * (points - centers[0])])
+    free = np.concatenate([problem.free.points, np.ones(count, bool)])
+    return eqx.tree_at(lambda p: (p.points, p.observations, p.free.points), problem, (start, observations, free))

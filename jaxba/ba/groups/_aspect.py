@@ -22,6 +22,7 @@ class AspectPrior(AbstractPrior):
     """Ratio of the first two parameters, `fx` and `fy`, of some cameras; for models that have both."""
 
     name: ClassVar[str] = "aspect"
+    in_world: ClassVar[tuple[str, ...] | None] = ()
     camera_index: Int[Array | np.ndarray, " rows"]
     ratio: Float[Array | np.ndarray, " rows"]
     std: Float[Array | np.ndarray, " rows"]

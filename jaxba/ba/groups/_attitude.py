@@ -33,6 +33,7 @@ class AttitudePrior(AbstractPrior):
     """
 
     name: ClassVar[str] = "attitude"
+    in_world: ClassVar[tuple[str, ...] | None] = ()
     image_index: Int[Array | np.ndarray, " rows"]
     quaternion: Float[Array | np.ndarray, "rows 4"]
     std_rad: Float[Array | np.ndarray, "rows 3"]

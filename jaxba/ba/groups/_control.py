@@ -20,6 +20,7 @@ class ControlPointPrior(AbstractPrior):
     """
 
     name: ClassVar[str] = "control"
+    in_world: ClassVar[tuple[str, ...] | None] = ("xyz",)
     point_index: Int[Array | np.ndarray, " rows"]
     xyz: Float[Array | np.ndarray, "rows 3"]
     std_m: Float[Array | np.ndarray, "rows 3"]

@@ -20,6 +20,7 @@ class IntrinsicsPrior(AbstractPrior):
     """
 
     name: ClassVar[str] = "intrinsics"
+    in_world: ClassVar[tuple[str, ...] | None] = ()
     camera_index: Int[Array | np.ndarray, " rows"]
     parameters: Float[Array | np.ndarray, "rows parameters"]
     std: Float[Array | np.ndarray, "rows parameters"]

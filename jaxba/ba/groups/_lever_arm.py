@@ -17,6 +17,7 @@ class LeverArmPrior(AbstractPrior):
     """Measured lever arm: `xyz` metres in the camera's frame, `std_m` a sigma an axis; one row."""
 
     name: ClassVar[str] = "lever_arm"
+    in_world: ClassVar[tuple[str, ...] | None] = ()
     xyz: Float[Array | np.ndarray, "1 3"]
     std_m: Float[Array | np.ndarray, "1 3"]
     loss: AbstractLoss = Linear()

@@ -26,6 +26,7 @@ class PositionPrior(AbstractPrior):
     """
 
     name: ClassVar[str] = "position"
+    in_world: ClassVar[tuple[str, ...] | None] = ("xyz",)
     image_index: Int[Array | np.ndarray, " rows"]
     xyz: Float[Array | np.ndarray, "rows 3"]
     std_m: Float[Array | np.ndarray, "rows 3"]

@@ -39,7 +39,8 @@ class Covariance:
     - `intrinsics`: of each camera, in its parameters' units. `lever_arm`: camera's frame, m^2. `points`: world, m^2.
     - `border`: joint covariance of the shared unknowns named in `border_names`: all refined intrinsics, then the lever
       arm. Where each image has its own camera, only the lever arm.
-    - `variance_factor`: `2 cost / redundancy`, near 1 where the sigmas are right; NaN without redundancy.
+    - `variance_factor`: near 1 where the sigmas are right, under any loss; `2 cost / redundancy` under least squares,
+      and where a loss is robust the same without the tail, which no sigma describes. NaN without redundancy.
     - `redundancy`: measured components that depend on something free, minus free unknowns.
     - `dropped`: observations and points that took no part.
     """
@@ -78,9 +79,10 @@ def covariance(problem: Problem, *, loss: AbstractLoss | None = None) -> Covaria
     with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
         system: System = jax.device_put(make_system(problem, plan, _as_arrays(Linear() if loss is None else loss)))
         unknowns: Unknowns = jax.device_put(initial_unknowns(problem, plan))
-        found = jax.device_get(marginals(system, plan, unknowns, np.array(0.0)))
+        num_free = np.array(_num_free(problem))
+        found = jax.device_get(marginals(system, plan, unknowns, num_free, np.array(0.0)))
         if not _determined(found):
-            damped = marginals(system, plan, unknowns, np.array(_PROBING))
+            damped = marginals(system, plan, unknowns, num_free, np.array(_PROBING))
             weakest = _weakest(jax.device_get(damped), plan, problem)
             raise JaxbaError(
                 f"Covariance: the measurements do not determine {weakest}. Hold it fixed or add a prior; an image "
@@ -113,7 +115,6 @@ def _in_order(found: Marginals, plan: Plan, problem: Problem, dropped: Dropped) 
         of_cameras = border[:num_shared, :num_shared].reshape(num_cameras, len(refined), num_cameras, len(refined))
         cameras = np.arange(num_cameras)
         intrinsics[np.ix_(cameras, refined, refined)] = of_cameras[cameras, :, cameras]
-    redundancy = int(found.num_rows) - _num_free(problem)
     return Covariance(
         poses=poses,
         centers=centers,
@@ -122,8 +123,8 @@ def _in_order(found: Marginals, plan: Plan, problem: Problem, dropped: Dropped) 
         points=np.asarray(found.points)[np.argsort(plan.point_order)],
         border=border,
         border_names=_border_names(plan, problem),
-        variance_factor=float(found.double_cost) / redundancy if redundancy > 0 else np.nan,
-        redundancy=redundancy,
+        variance_factor=float(found.variance_factor),
+        redundancy=int(found.redundancy),
         dropped=dropped,
     )
 

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from dense_reference import Dense, loss_derivatives
 from quick_jit import quick_jit
+from scipy.optimize import brentq
+from scipy.stats import chi2
+from small_problems import one_of
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import IntrinsicsPrior, Observations, Problem, Step, _covariance as module, covariance
+from jaxba.ba import IntrinsicsPrior, Observations, Problem, Step, _covariance as module, covariance, solve
 from jaxba.geometry import AbstractLoss, Cauchy, Huber, Linear
 from jaxba.simulation import Survey, uav_block
 
@@ -66,7 +69,7 @@ class DenseCovariance:
 
     matrix: np.ndarray
     step: Step
-    double_cost: float
+    variance_factor: float
     redundancy: int
 
     def of(self, place: np.ndarray) -> np.ndarray:
@@ -75,14 +78,14 @@ class DenseCovariance:
 
 def dense_covariance(problem: Problem, loss: AbstractLoss) -> DenseCovariance:
     dense = Dense(problem, loss)
-    normal, double_cost, rows = np.zeros((dense.size, dense.size)), 0.0, 0
+    normal, squares = np.zeros((dense.size, dense.size)), []
     for residual, jacobian, group_loss in dense.groups():
         depends = (jacobian != 0).any(axis=2)
-        value, weight, _ = loss_derivatives(group_loss, np.sum(np.where(depends, residual, 0) ** 2, axis=1))
+        squared = np.sum(np.where(depends, residual, 0) ** 2, axis=1)
+        squares.append((isinstance(group_loss, Linear), squared, depends.sum(axis=1)))
+        _, weight, _ = loss_derivatives(group_loss, squared)
         jacobian = (jacobian * np.sqrt(weight)[:, None, None]).reshape(-1, dense.size)
         normal += jacobian.T @ jacobian
-        double_cost += float(np.sum(value))
-        rows += int(depends.sum())
     scale = 1 / np.sqrt(np.diag(normal))
     names = type(problem.cameras).parameter_names()
     shapes = (problem.num_images, 6), (problem.num_cameras, len(names)), (3,), (problem.num_points, 3)
@@ -92,7 +95,30 @@ def dense_covariance(problem: Problem, loss: AbstractLoss) -> DenseCovariance:
     place = dense.flat(step).astype(int)
     matrix = np.zeros((ends[-1], ends[-1]))
     matrix[np.ix_(place, place)] = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
-    return DenseCovariance(matrix, step, double_cost, rows - dense.size)
+    redundancy = sum(int(count.sum()) for _, _, count in squares) - dense.size
+    return DenseCovariance(matrix, step, dense_variance_factor(squares, redundancy), redundancy)
+
+
+def dense_variance_factor(squares: list[tuple[bool, np.ndarray, np.ndarray]], redundancy: int) -> float:
+    """Return the factor at which squares, cut off at the 99th percentile where a loss is robust, are as expected.
+
+    The expectation is an integral, and the equation is solved by bisection.
+    """
+    left = redundancy / sum(count.sum() for _, _, count in squares)
+    expected = 0.0
+    limits = []
+    for linear, _, count in squares:
+        some = range(1, int(count.max()) + 1)
+        limit = np.array([np.inf, *(np.inf if linear else chi2.ppf(0.99, c) for c in some)])
+        mean = [0.0, *(c if linear else chi2.expect(lambda x, m=limit[c]: min(x, m), (c,)) for c in some)]
+        limits.append(limit[count])
+        expected += left * np.sum(np.array(mean)[count])
+
+    def surplus(factor: float) -> float:
+        cut = [np.minimum(s, m * left * factor) for (_, s, _), m in zip(squares, limits, strict=True)]
+        return float(sum(np.sum(c) for c in cut) - expected * factor)
+
+    return brentq(surplus, 1e-9, 1e9, xtol=1e-12, rtol=1e-12)
 
 
 def assert_same(found: np.ndarray, expected: np.ndarray) -> None:
@@ -119,7 +145,7 @@ def test_covariances_equal_a_dense_inverse(case: str):
     by_name |= {f"lever arm {axis}": place.lever_arm[i] for i, axis in enumerate("xyz")}
     assert_same(found.border, dense.of(np.array([by_name[name] for name in found.border_names], int)))
     assert found.redundancy == dense.redundancy
-    assert found.variance_factor == pytest.approx(dense.double_cost / dense.redundancy, rel=1e-9)
+    assert found.variance_factor == pytest.approx(dense.variance_factor, rel=1e-6)
 
 
 def with_a_fixed_point() -> Problem:
@@ -143,6 +169,22 @@ def test_variance_factor_is_one_for_noise_as_large_as_its_sigma():
     # at the truth 2 cost is chi-squared with as many degrees as rows, not as the redundancy
     rows = 2 * problem.num_observations + 36
     assert found.variance_factor * found.redundancy / rows == pytest.approx(1.0, abs=4 * np.sqrt(2 / rows))
+
+
+@pytest.mark.parametrize("index", [1, 2, 3], ids=["soft_l1", "huber", "cauchy"])
+@pytest.mark.parametrize("times", [1.0, 3.0])
+def test_variance_factor_tells_right_sigmas_from_small_ones_under_any_loss(index: int, times: float):
+    loss = one_of(index)
+    problem = uav_block(12, seed=6, points_per_image=28.0, mean_track_length=6.0).problem
+    small = dataclasses.replace(problem.observations, std_px=problem.observations.std_px / times)
+    position = problem.priors[0]
+    problem = dataclasses.replace(
+        problem, observations=small, priors=(dataclasses.replace(position, std_m=position.std_m / times),)
+    )
+    loss = dataclasses.replace(loss, f_scale=loss.f_scale * times)
+    solution = solve(problem, loss=loss)
+    factor = covariance(solution.apply(problem), loss=loss).variance_factor
+    assert factor == pytest.approx(times**2, rel=0.1)  # the sigma of a variance of 2,000 residuals is 3%
 
 
 def test_point_seen_once_is_left_out_and_reported():

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.geometry import check_loss
 
 _QUATERNION_NORM = 1e-3  # files round quaternions to a few digits; more than this is a mistake
 
@@ -182,6 +183,7 @@ def _check_bounds(problem: Problem) -> None:
 
 def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int]) -> None:
     """Check any prior from its fields: `<kind>_index` refers to a kind, `std...` is a sigma, all else are values."""
+    check_loss(f"prior {prior.name}: loss", prior.loss)
     fields = [f for f in dataclasses.fields(prior) if f.name != "loss"]
     values = {f.name: np.asarray(getattr(prior, f.name)) for f in fields}
     sizes = {**sizes, "rows": _length(values[fields[0].name])}

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxba.ba._check import Dropped
 from jaxba.ba._gauge import free_gauge
+from jaxba.ba._plausible import implausible_cameras
 from jaxba.ba._problem import Problem
 from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
 from jaxba.ba._unknowns import Unknowns
@@ -142,8 +143,18 @@ class Solution(eqx.Module):
 
     @property
     def advice(self) -> str:
-        """Why the solver stopped, and what to do."""
-        return _ADVICE[self.result]
+        """Why the solver stopped, and what to do; also where a camera became what no lens can be."""
+        found = self.implausible_cameras
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        return f"{_ADVICE[self.result]} Not to be used as it is: {found[0]}{more}." if found else _ADVICE[self.result]
+
+    @property
+    def implausible_cameras(self) -> list[str]:
+        """Sentences on cameras that the solver took where no lens can be, such as to a negative focal length.
+
+        Empty for a solve inside `jit`, `vmap` or a derivative.
+        """
+        return [] if self.report is None else implausible_cameras(self.apply(self.report.problem), few=0.0)
 
     def apply(self, problem: Problem) -> Problem:
         """Return the problem with the solution's values as start values."""

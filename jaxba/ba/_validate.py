@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 
 from jaxba._errors import JaxbaError
+from jaxba.ba._plausible import implausible_cameras
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.geometry import check_loss
 
 _QUATERNION_NORM = 1e-3  # files round quaternions to a few digits; more than this is a mistake
+
+_LARGEST = 1e30  # of any number, and of one over any sigma: the fourth power is finite in float64
 
 _Label = Callable[[int], str]
 
@@ -77,6 +80,9 @@ def validate(problem: Problem) -> None:
         raise JaxbaError("Nothing is free, so there is nothing to adjust. Free the poses, points or intrinsics.")
     if sizes["observations"] == 0:
         raise JaxbaError("observations are empty; an adjustment needs points measured in images.")
+    implausible = implausible_cameras(problem)
+    if implausible:
+        raise JaxbaError(f"cameras: {implausible[0]}{_more(np.array(implausible))}.")
 
 
 def _length(value: Any) -> int:
@@ -109,12 +115,19 @@ def _check_finite(field: str, value: Any, label: _Label) -> None:
     array = np.asarray(value)
     if not np.isfinite(array).all():
         _raise_entry(field, array, ~np.isfinite(array), label, "give a finite value or leave the entry out")
+    if np.max(np.abs(array), initial=0.0) > _LARGEST:
+        cure = f"correct it or leave the entry out: beyond {_LARGEST:g}, squares are no longer finite"
+        _raise_entry(field, array, np.abs(array) > _LARGEST, label, cure)
 
 
 def _check_positive(field: str, value: Any, label: _Label) -> None:
     array = np.asarray(value)
     if not (array > 0).all():
         _raise_entry(field, array, ~(array > 0), label, "a sigma must be positive")
+    absurd = (array < 1 / _LARGEST) | (np.isfinite(array) & (array > _LARGEST))
+    if absurd.any():
+        cure = f"give a sigma from {1 / _LARGEST:g} to {_LARGEST:g}"
+        _raise_entry(field, array, absurd, label, cure)
 
 
 def _check_quaternion(field: str, value: Any, label: _Label) -> None:

@@ -152,6 +152,7 @@ def uav_block(
         ("focal_error", focal_error, -0.9, 10.0),
         ("point_error_m", point_error_m, 0.0, _MOST),
         ("seed", seed, 0, np.inf),
+        *((f"camera.{name}", getattr(camera, name), 1.0, _MOST) for name in _FOCAL if name in camera.parameter_names()),
         ("outlier_fraction", outlier_fraction, 0.0, 1.0),
         ("gnss_outlier_fraction", gnss_outlier_fraction, 0.0, 1.0),
     ):

@@ -229,3 +229,8 @@ def test_impossible_blocks_are_refused_with_the_cure(options: dict, message: str
 def test_an_option_out_of_range_is_named(name: str, value: float):
     with pytest.raises(JaxbaError, match=f"{name}={value} is out of range; choose it from"):
         uav_block(8, **{name: value})
+
+
+def test_a_negative_focal_length_is_named():
+    with pytest.raises(JaxbaError, match=r"camera.f=-900.0 is out of range"):
+        uav_block(8, camera=Radial(-900.0, 0.0, 0.0, 0.0, 0.0))

@@ -55,7 +55,7 @@ def implausible_cameras(problem: Problem, *, few: float = 0.5) -> list[str]:
         radius = np.hypot((x - cx[of_observation]) / fx[of_observation], (y - cy[of_observation]) / fy[of_observation])
     order = np.argsort(of_observation, kind="stable")
     ends = np.cumsum(np.bincount(of_observation, minlength=problem.num_cameras))
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for camera, radii in enumerate(np.split(radius[order], ends[:-1])):
             if len(radii):
                 reason = _reason({name: float(value[camera]) for name, value in values.items()}, radii, problem, few)
@@ -76,7 +76,7 @@ def _reason(values: dict[str, float], radii: Float[np.ndarray, " n"], problem: P
         )
     coefficients = [values[name] for name in ("k1", "k2", "k3", "k4") if name in values]
     tangential = float(np.hypot(values.get("p1", 0.0), values.get("p2", 0.0)))
-    if model not in CAMERAS.values() or not (any(coefficients) or tangential):
+    if model not in CAMERAS.values() or not (any(coefficients) or tangential) or not np.isfinite(tangential):
         return ""
     lens = ", ".join(f"{name} = {values[name]:.4g}" for name in values if name[0] in "kp")
     fold = _first_root([1.0, -6 * tangential, *_even([(2 * i + 3) * k for i, k in enumerate(coefficients)])])
@@ -93,7 +93,7 @@ def _reason(values: dict[str, float], radii: Float[np.ndarray, " n"], problem: P
             "of its pixels lie beyond, where no direction has any; start from no distortion, hold some of it fixed, or "
             "bound it"
         )
-    undistorted = _first_root([-middle, 1.0, *_even([0.0, *coefficients])[1:]])
+    undistorted = _first_root([-middle, 1.0, *_even([0.0, *coefficients])[1:]]) if middle > 0 else np.inf
     if middle > _MOST_STRETCH * undistorted:
         return (
             f"({lens}) has a distortion that stretches the image {middle / undistorted:.3g} times; start from no "
@@ -109,6 +109,6 @@ def _even(coefficients: list[float]) -> list[float]:
 
 def _first_root(ascending: list[float]) -> np.float64:
     """Return the least positive real root of a polynomial, infinite without one."""
-    roots = np.roots(np.trim_zeros(ascending[::-1], "f"))
-    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
-    return real.min(initial=np.inf)
+    inverse = np.roots(np.trim_zeros(ascending, "b"))  # of the reversed polynomial, whose first entry is not small
+    real = inverse.real[(np.abs(inverse.imag) <= 1e-9 * np.abs(inverse)) & (inverse.real > 0)]
+    return 1 / real.max(initial=0.0)

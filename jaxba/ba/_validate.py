@@ -130,6 +130,29 @@ def _check_positive(field: str, value: Any, label: _Label) -> None:
         _raise_entry(field, array, absurd, label, cure)
 
 
+def _check_precision(field: str, value: np.ndarray, std: np.ndarray, label: _Label) -> None:
+    """Refuse coordinates that have been float32 where its steps are coarser than their sigmas: 0.5 m at 4.6e6 m.
+
+    What is float64 by now has been float32 where every coordinate of an axis is one that float32 has: of other numbers
+    one in 500 million is. Whole numbers are all that an axis of true ones may hold by chance.
+    """
+    if not value.size or not np.max(np.abs(value)) <= _LARGEST or value.shape != std.shape:
+        return
+    step = np.spacing(np.abs(value).astype(np.float32)).astype(float)
+    is_single = np.ones(value.shape[1], bool)
+    if value.dtype == np.float64:
+        is_single = np.all(value == value.astype(np.float32), axis=0)
+        is_single &= np.any(value != np.round(value), axis=0) | np.all(step >= 2, axis=0)
+    coarse = is_single & (step > std)
+    if coarse.any():
+        row, more = int(np.argwhere(coarse)[0][0]), _more(np.unique(np.argwhere(coarse)[:, 0]))
+        raise JaxbaError(
+            f"{field}: {label(row)}: {value[coarse][0]:.9g}{more} is rounded to steps of {step[coarse][0]:g} m, as "
+            f"float32 is there, coarser than its sigma of {std[coarse][0]:g} m; subtract an origin near the block in float64 "
+            "before, or give float64."
+        )
+
+
 def _check_quaternion(field: str, value: Any, label: _Label) -> None:
     _check_finite(field, value, label)
     norm = np.linalg.norm(np.asarray(value, float), axis=-1)
@@ -218,6 +241,8 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
             continue
         name, value = f"prior {prior.name}: {field.name}", values[field.name]
         _check_shape(name, value, _dims(field.type), sizes)
+        if field.name == "xyz":
+            _check_precision(name, value, values["std_m"], label)
         if field.name.startswith("std"):
             _check_positive(f"{name} (infinite where nothing is known)", value, label)
         elif field.name == "quaternion":

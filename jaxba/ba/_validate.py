@@ -148,8 +148,8 @@ def _check_precision(field: str, value: np.ndarray, std: np.ndarray, label: _Lab
         row, more = int(np.argwhere(coarse)[0][0]), _more(np.unique(np.argwhere(coarse)[:, 0]))
         raise JaxbaError(
             f"{field}: {label(row)}: {value[coarse][0]:.9g}{more} is rounded to steps of {step[coarse][0]:g} m, as "
-            f"float32 is there, coarser than its sigma of {std[coarse][0]:g} m; subtract an origin near the block in float64 "
-            "before, or give float64."
+            f"float32 is there, coarser than its sigma of {std[coarse][0]:g} m; subtract an origin near the block in "
+            "float64 before, or give float64."
         )
 
 

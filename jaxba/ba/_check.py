@@ -4,9 +4,12 @@ What contradicts itself is an error (`_validate.py`). What an adjustment can do 
 
 - observations of points behind their camera, or without a pixel, at the start values;
 - points seen fewer than twice: nothing fixes their depth. Control points with finite sigmas and fixed points stay;
-- images that have no observation left, and cameras of no image that has one: held fixed, their priors without effect.
+- images whose pose is not determined by what they see and their priors (fewer than three points, or all on one line):
+  held fixed with their priors without effect, their observations left out, and what is seen once after that as well;
+- images that have no observation left, and cameras of no image that has one: held fixed, their priors without effect;
+- intrinsics of a camera that what it sees and its priors leave open: held fixed.
 
-Nothing in this list makes anything above it true anew, so one pass is final. Cost: 500k observations take under 0.1 s.
+Cost: 500k observations take 0.2 s; more where images are left out, since the first three are then looked at again.
 """
 
 import dataclasses
@@ -14,9 +17,10 @@ import enum
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxba._errors import JaxbaError
+from jaxba.ba._local_rank import pose_ranks, undetermined_intrinsics
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import points_in_cam, project
 from jaxba.ba._validate import validate
@@ -31,6 +35,7 @@ class Reason(enum.IntEnum):
     BEHIND = 1
     NO_PIXEL = 2
     SEEN_ONCE = 3
+    WEAK_IMAGE = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +44,10 @@ class Dropped:
 
     - `reason`: a `Reason` for each observation.
     - `points`: free points seen fewer than twice, now held fixed. `times_measured`: how often each was measured.
-    - `images`, `cameras`: free ones without an observation, now held fixed.
+    - `images`, `cameras`: free ones without an observation that counts, now held fixed.
+    - `ranks`: of each of these images, how many of the six directions of its pose its own observations and priors
+      determined; 0 without any.
+    - `intrinsics`: those of cameras with observations that nothing determines, now held fixed.
     """
 
     reason: UInt8[np.ndarray, " observations"]
@@ -47,6 +55,9 @@ class Dropped:
     times_measured: Int[np.ndarray, " dropped_points"]
     images: Int[np.ndarray, " dropped_images"]
     cameras: Int[np.ndarray, " dropped_cameras"]
+    ranks: Int[np.ndarray, " dropped_images"]
+    intrinsics: Bool[np.ndarray, "cameras parameters"]
+    parameter_names: tuple[str, ...]
     image_names: tuple[str, ...] = ()
 
     @property
@@ -56,7 +67,8 @@ class Dropped:
 
     def any(self) -> bool:
         """Whether anything was left out or held fixed."""
-        return bool(self.observations.any() or len(self.points) or len(self.images) or len(self.cameras))
+        held = len(self.points) or len(self.images) or len(self.cameras) or self.intrinsics.any()
+        return bool(self.observations.any() or held)
 
     def count(self, reason: Reason) -> int:
         """Return how many observations were left out for this reason."""
@@ -84,16 +96,33 @@ class Dropped:
         if never.any():
             points = self.points[never]
             lines.append(f"{_many(len(points), 'point')} seen in no image held fixed ({_first(points)})")
-        if len(self.images):
-            labels = [f"{i} {self.image_names[i]}" if self.image_names else str(i) for i in self.images[:3]]
+        idle, weak = self.images[self.ranks == 0], self.images[self.ranks > 0]
+        if len(weak):
+            few = " or ".join(str(rank) for rank in np.unique(self.ranks[self.ranks > 0]))
+            seen = _many(self.count(Reason.WEAK_IMAGE), "observation")
             lines.append(
-                f"{_many(len(self.images), 'image')} without observations held fixed ({_first(self.images, labels)})"
+                f"{_many(len(weak), 'image')} with too few points held fixed, {seen} left out "
+                f"({self._first_images(weak)}): what they see and their priors determine {few} of a pose's 6 unknowns"
             )
+        if len(idle):
+            lines.append(f"{_many(len(idle), 'image')} without observations held fixed ({self._first_images(idle)})")
         if len(self.cameras):
             lines.append(
                 f"{_many(len(self.cameras), 'camera')} without observations held fixed ({_first(self.cameras)})"
             )
+        weak = np.flatnonzero(self.intrinsics.any(axis=1))
+        if len(weak):
+            labels = [
+                f"{camera} {', '.join(np.array(self.parameter_names)[self.intrinsics[camera]])}" for camera in weak[:3]
+            ]
+            lines.append(
+                f"{_many(len(weak), 'camera')} with intrinsics held fixed that its observations and priors do not "
+                f"determine ({_first(weak, labels)})"
+            )
         return lines
+
+    def _first_images(self, images: Int[np.ndarray, " n"]) -> str:
+        return _first(images, [f"{i} {self.image_names[i]}" if self.image_names else str(i) for i in images[:3]])
 
     def _first(self, reason: Reason) -> str:
         return _first(np.flatnonzero(self.reason == reason))
@@ -130,15 +159,25 @@ def prepare(problem: Problem) -> Prepared:
     free_poses, free_points = np.array(free.poses), np.array(free.points)
     free_intrinsics = np.array(free.intrinsics)
 
-    reason = _reason_at_start(problem)
+    point_in_cam = points_in_cam(problem)
+    reason = _reason_at_start(problem, point_in_cam)
     given = np.bincount(point, minlength=problem.num_points)
-    visible = reason == Reason.KEPT
-    counts = given if visible.all() else np.bincount(point[visible], minlength=problem.num_points)
-    loose = free_points & (counts < 2) & ~_controlled(problem)
-    reason[visible & loose[point]] = Reason.SEEN_ONCE
-    kept = np.flatnonzero(reason == Reason.KEPT)
-    if not len(kept):
-        raise JaxbaError(_nothing_left(reason))
+    controlled, ranks = _controlled(problem), np.zeros(problem.num_images, int)
+    while True:
+        visible = reason == Reason.KEPT
+        counts = given if visible.all() else np.bincount(point[visible], minlength=problem.num_points)
+        loose = free_points & (counts < 2) & ~controlled
+        reason[visible & loose[point]] = Reason.SEEN_ONCE
+        kept = np.flatnonzero(reason == Reason.KEPT)
+        if not len(kept):
+            raise JaxbaError(_nothing_left(reason))
+        seen_now = np.bincount(image[kept], minlength=problem.num_images) > 0
+        found = pose_ranks(problem, kept, point_in_cam)
+        weak = free_poses & seen_now & (found < 6)
+        if not weak.any():
+            break
+        ranks[weak] = found[weak]
+        reason[kept[weak[image[kept]]]] = Reason.WEAK_IMAGE
 
     has_observation = np.zeros(problem.num_images, bool)
     has_observation[image[kept]] = True
@@ -146,18 +185,23 @@ def prepare(problem: Problem) -> Prepared:
     has_image[np.asarray(problem.camera_index)[has_observation]] = True
     idle_images = free_poses & ~has_observation
     idle_cameras = free_intrinsics.any(axis=1) & ~has_image
+    open_intrinsics = undetermined_intrinsics(problem, kept, point_in_cam)
     dropped = Dropped(
         reason=reason,
         points=np.flatnonzero(loose),
         times_measured=given[loose],
         images=np.flatnonzero(idle_images),
         cameras=np.flatnonzero(idle_cameras),
+        ranks=ranks[idle_images],
+        intrinsics=open_intrinsics,
+        parameter_names=type(problem.cameras).parameter_names(),
         image_names=problem.image_names,
     )
     if not dropped.any():
         return Prepared(problem, dropped, kept)
 
     free_points[loose], free_poses[idle_images], free_intrinsics[idle_cameras] = False, False, False
+    free_intrinsics[open_intrinsics] = False
     if not (free_points.any() or free_poses.any() or free_intrinsics.any() or np.any(free.lever_arm)):
         summary = "; ".join(dropped.summary())
         raise JaxbaError(f"Nothing that is free is measured: {summary}. Free more, or measure more.")
@@ -172,9 +216,10 @@ def prepare(problem: Problem) -> Prepared:
     return Prepared(changed, dropped, kept)
 
 
-def _reason_at_start(problem: Problem) -> UInt8[np.ndarray, " observations"]:
+def _reason_at_start(
+    problem: Problem, point: Float[np.ndarray, "3 observations"]
+) -> UInt8[np.ndarray, " observations"]:
     """Leave out what the start values put behind a camera or give no pixel."""
-    point = points_in_cam(problem)
     depth = point[2]
     reason = np.zeros(len(depth), np.uint8)
     grazing = np.flatnonzero(depth <= _GRAZING * np.sqrt(point[0] ** 2 + point[1] ** 2 + depth**2))
@@ -211,10 +256,11 @@ def _without_effect(prior: AbstractPrior, held: dict[str, Bool[np.ndarray, " n"]
 
 
 def _nothing_left(reason: UInt8[np.ndarray, " observations"]) -> str:
-    behind, no_pixel, once = (np.count_nonzero(reason == r) for r in (Reason.BEHIND, Reason.NO_PIXEL, Reason.SEEN_ONCE))
+    behind, no_pixel, once, weak = (np.count_nonzero(reason == r) for r in list(Reason)[1:])
     return (
         f"No observation is left of {len(reason)}: {behind} are of points behind their camera, {no_pixel} have no "
-        f"pixel, {once} are of points seen once. If most are behind, poses may be world_from_cam: give cam_from_world."
+        f"pixel, {once} are of points seen once, {weak} in images that see too few points. If most are behind, poses "
+        "may be world_from_cam: give cam_from_world."
     )
 
 

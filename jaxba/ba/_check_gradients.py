@@ -34,7 +34,7 @@ from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._system import initial_unknowns, make_system
 from jaxba.ba._traced import solve_to_the_last_digits
-from jaxba.geometry import AbstractLoss, Linear
+from jaxba.geometry import AbstractLoss, Linear, require_number
 
 _MOVES, _LARGEST_STEP = 0.05, 5e-3  # sigmas of all unknowns together; of the input's sigma
 _SHARES = (1.0, 1 / 4, 1 / 16)  # of that step
@@ -119,8 +119,8 @@ def check_gradients(
     >>> checked.passed, checked.rows[0].name  # doctest: +SKIP
     (True, 'pixels')
     """
-    if not tolerance > 0:
-        raise JaxbaError(f"tolerance {tolerance}: give a positive number, e.g. 1e-5.")
+    cure = "give a positive number, e.g. 1e-5"
+    require_number("check_gradients: tolerance", tolerance, np.finfo(float).tiny, np.finfo(float).max, cure)
     loss = Linear() if loss is None else loss
     problem = prepare(problem).problem
     require_gauge(problem, "Derivatives")

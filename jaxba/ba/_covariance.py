@@ -22,7 +22,7 @@ from jaxba.ba._problem import Problem
 from jaxba.ba._projection import rotation_matrices
 from jaxba.ba._system import System, initial_unknowns, make_system
 from jaxba.ba._unknowns import Unknowns
-from jaxba.geometry import AbstractLoss, Linear
+from jaxba.geometry import AbstractLoss, Linear, check_loss
 
 MAX_UNKNOWNS = 6500  # 1000 images with one camera take 5 s and 0.8 GB beside what is loaded
 _PROBING = 1e-9  # damping, relative, under which a singular system shows where it is weak
@@ -71,6 +71,8 @@ def covariance(problem: Problem, *, loss: AbstractLoss | None = None) -> Covaria
     >>> found.poses.shape, found.points.shape[1:], found.border_names[:2]
     ((8, 6, 6), (3, 3), ('camera 0 fx', 'camera 0 fy'))
     """
+    if loss is not None:
+        check_loss("covariance: loss", loss)
     prepared = prepare(problem)
     problem = prepared.problem
     require_gauge(problem, "Covariance")

@@ -28,6 +28,7 @@ from jaxba.ba._connected_parts import Parts, hat, mean_by
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._rows import Rows
 from jaxba.ba._unknowns import Unknowns
+from jaxba.ba._validate import validate
 from jaxba.geometry import Pose
 
 _CHUNK = 256
@@ -49,11 +50,14 @@ def free_gauge(problem: Problem) -> tuple[str, ...]:
     a line that is no axis is named by the axes it is made of, `rotation about x + rotation about y`; the centre of a
     rotation or of the scaling is not told. `lever arm z` appears where a free lever arm is not determined.
 
+    Raises `JaxbaError` where the problem contradicts itself or holds impossible values.
+
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(8, gnss_std_m=None)
     >>> len(jaxba.ba.free_gauge(survey.problem)), jaxba.ba.free_gauge(survey.problem.fix(poses=[0]))
     (7, ('scale',))
     """
+    validate(problem)
     parts = Parts.of(problem)
     normal, lever_prior = _normal_matrices(problem, parts)
     columns = 10 if problem.free.lever_arm and not _lever_arm_determined(normal, lever_prior) else 7
@@ -96,7 +100,7 @@ def _normal_matrices(
     for prior in problem.priors:
         if not problem.free.lever_arm and not _null(normal[:, :7, :7])[1].any():
             break  # all is held already: the other priors need not be compiled
-        rows = _derivatives(prior, problem)
+        rows = prior_rows(prior, problem)
         if rows is None:
             continue
         if rows.pose is None and rows.point is None:
@@ -179,7 +183,7 @@ def _names(null: Float[np.ndarray, "free columns"]) -> list[str]:
     return names
 
 
-def _derivatives(prior: AbstractPrior, problem: Problem) -> Rows | None:
+def prior_rows(prior: AbstractPrior, problem: Problem) -> Rows | None:
     """Return a prior's rows by poses, points and the lever arm, numpy; evaluated on pieces of one size.
 
     None for a prior of cameras, or without rows.

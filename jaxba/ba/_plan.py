@@ -17,7 +17,7 @@ Cost: O(observations log observations + pairs log pairs); 0.1 s for 500 images, 
 """
 
 import dataclasses
-from typing import Literal
+from typing import Literal, get_args
 
 import equinox as eqx
 import numpy as np
@@ -28,7 +28,9 @@ from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.spatial.transform import Rotation
 
+from jaxba._errors import JaxbaError
 from jaxba.ba._problem import Problem
+from jaxba.geometry import require_number
 
 ROW_RUN = 32
 CHUNK_RUNS = 64  # runs computed at a time: 36 numbers a row, 0.6 MB
@@ -123,7 +125,14 @@ def make_plan(
     For a series of like problems, whose observations come and go, that shall share compiled code: `spare` leaves room
     for this share of points, observations and pairs more, and `like`, the shape of an earlier plan of the series, gives
     the least sizes and the linear solver. What outgrows it gets a shape of its own.
+
+    Raises `JaxbaError` for options out of range.
     """
+    if linear_solver not in get_args(LinearSolver):
+        raise JaxbaError(
+            f"make_plan: linear_solver {linear_solver!r}: choose one of {', '.join(get_args(LinearSolver))}."
+        )
+    require_number("make_plan: spare", spare, 0.0, 1e3, "give a share of 0 or more, such as 0.1")
     image = np.asarray(problem.observations.image_index)
     point = np.asarray(problem.observations.point_index)
     free_pose, free_point = np.asarray(problem.free.poses), np.asarray(problem.free.points)

@@ -7,7 +7,7 @@ block), pixels in the images with the first pixel's centre at (0.5, 0.5), radian
 
 import abc
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._rows import Rows
+from jaxba.ba._selection import Selection, selected, selected_names
 from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractCamera, AbstractLoss, Pose
 
@@ -95,7 +96,7 @@ class Problem(eqx.Module):
     free: Free
     lower: Float[Array | np.ndarray, "cameras parameters"]
     upper: Float[Array | np.ndarray, "cameras parameters"]
-    image_names: tuple[str, ...] = eqx.field(static=True, default=())
+    image_names: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
 
     @property
     def num_images(self) -> int:
@@ -163,38 +164,60 @@ class Problem(eqx.Module):
     def fix(
         self,
         *,
-        poses: Sequence[int] | bool = False,
-        points: Sequence[int] | bool = False,
-        intrinsics: Sequence[str] | bool = False,
+        poses: Selection = None,
+        points: Selection = None,
+        intrinsics: Selection = None,
     ) -> "Problem":
         """Return the problem with more blocks held fixed.
 
-        Each argument is True for all of its kind, or the indices (of intrinsics: the parameters' names) to fix.
+        Each argument is True for all of its kind, an index, indices or a mask (list, range, numpy or jax array), or a
+        slice; None and False are none. Intrinsics are chosen by the parameters' names or by their place in the model;
+        a mask with a row for each camera chooses them camera by camera.
+
+        Raises `JaxbaError` for an index out of range, one below 0, a mask of another length, and an unknown name.
+
+        >>> import jaxba
+        >>> problem = jaxba.synthetic.uav_block(8).problem.fix(poses=[0, 7], intrinsics="k1")
+        >>> problem.free.poses.tolist(), problem.free.intrinsics[0].tolist()
+        ([False, True, True, True, True, True, True, False], [True, True, True, True, False, True, True, True, False])
         """
-        free_poses, free_points = np.array(self.free.poses), np.array(self.free.points)
-        free_intrinsics = np.array(self.free.intrinsics)
-        free_poses[slice(None) if poses is True else list(poses or ())] = False
-        free_points[slice(None) if points is True else list(points or ())] = False
-        names = type(self.cameras).parameter_names()
-        fixed_names = names if intrinsics is True else tuple(intrinsics or ())
-        for name in fixed_names:
-            if name not in names:
-                raise JaxbaError(f"intrinsic {name!r}: a {type(self.cameras).__name__} camera has {', '.join(names)}.")
-            free_intrinsics[:, names.index(name)] = False
-        free = Free(free_poses, free_points, free_intrinsics, self.free.lever_arm)
+        model, names = type(self.cameras).__name__, type(self.cameras).parameter_names()
+        fixed_poses = selected("fix: poses", poses, self.num_images, "images")
+        fixed_points = selected("fix: points", points, self.num_points, "points")
+        if np.ndim(intrinsics) == 2 and np.shape(intrinsics) == self.free.intrinsics.shape:
+            of_cameras = np.ravel(np.asarray(intrinsics))
+            fixed = selected("fix: intrinsics", of_cameras, of_cameras.size, "intrinsics of cameras")
+            fixed_intrinsics = fixed.reshape(self.free.intrinsics.shape)
+        else:
+            fixed_intrinsics = selected_names("fix: intrinsics", intrinsics, names, f"intrinsics of a {model} camera:")
+        free = Free(
+            np.asarray(self.free.poses) & ~fixed_poses,
+            np.asarray(self.free.points) & ~fixed_points,
+            np.asarray(self.free.intrinsics) & ~fixed_intrinsics,
+            self.free.lever_arm,
+        )
         return eqx.tree_at(lambda p: p.free, self, free)
 
-    def bound(self, **bounds: tuple[float, float]) -> "Problem":
+    def bound(self, **bounds: Any) -> "Problem":
         """Return the problem with box bounds on intrinsics, e.g. `bound(k1=(-0.1, 0.1))`.
 
         `focal=(0.9, 1.1)` bounds every focal length relative to its start value; all other names are parameters of the
-        model, with absolute bounds.
+        model, with absolute bounds. A bound is a number, or one for each camera.
         """
         names = type(self.cameras).parameter_names()
         lower, upper = np.array(self.lower), np.array(self.upper)
-        for key, (low, high) in bounds.items():
-            if not low < high:
-                raise JaxbaError(f"bounds {key}={low},{high}: the lower bound must be below the upper one.")
+        for key, pair in bounds.items():
+            try:
+                low, high = (np.broadcast_to(np.asarray(bound, float), self.num_cameras) for bound in pair)
+            except (TypeError, ValueError) as error:
+                raise JaxbaError(
+                    f"bounds {key}={pair}: give the lower and the upper one, each a number or one for each of "
+                    f"{self.num_cameras} cameras."
+                ) from error
+            for camera in np.flatnonzero(~(low < high)):
+                raise JaxbaError(
+                    f"bounds {key}={low[camera]:g},{high[camera]:g}: the lower bound must be below the upper one."
+                )
             if key == "focal":
                 for name in names:
                     if name in ("f", "fx", "fy"):

@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float, Int
 from jaxba._errors import JaxbaError
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import points_in_cam, project
+from jaxba.ba._selection import Selection, selected
+from jaxba.geometry import require_number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,12 +76,10 @@ def reprojection_errors(problem: Problem) -> Float[np.ndarray, " observations"]:
     return np.where(visible, error, np.inf)
 
 
-def quality(
-    problem: Problem, used: Bool[np.ndarray, " observations"] | None = None, *, mad_factor: float = 2.5
-) -> Quality:
+def quality(problem: Problem, used: Selection = None, *, mad_factor: float = 2.5) -> Quality:
     """Return the reprojection errors at the problem's present values, their statistics and the inliers.
 
-    - `used`: the observations that statistics are over; all by default.
+    - `used`: the observations that statistics are over, as indices or a mask; all by default.
     - `mad_factor`: of the MAD, from the median to the threshold.
 
     Raises `JaxbaError` if no observation is used.
@@ -90,10 +90,8 @@ def quality(
     >>> len(found.images.median_px), bool(found.threshold_px == found.median_px + 2.5 * found.mad_px)
     (8, True)
     """
-    if used is None:
-        used = np.ones(problem.num_observations, bool)
-    if used.shape != (problem.num_observations,):
-        raise JaxbaError(f"used has shape {used.shape}; give one entry for each of {problem.num_observations} pixels.")
+    require_mad_factor(mad_factor)
+    used = selected("used", True if used is None else used, problem.num_observations, "observations")
     if not used.any():
         raise JaxbaError("No observation is used, so there are no errors to judge; give a mask with some True.")
     error = reprojection_errors(problem)
@@ -119,6 +117,13 @@ def quality(
         images=_group_errors(of_used, image[used], problem.num_images),
         points=_group_errors(of_used, np.asarray(problem.observations.point_index)[used], problem.num_points),
         cameras=_group_errors(of_used, np.asarray(problem.camera_index)[image[used]], problem.num_cameras),
+    )
+
+
+def require_mad_factor(mad_factor: float) -> None:
+    """Raise `JaxbaError` for a factor that is not positive and finite."""
+    require_number(
+        "mad_factor", mad_factor, np.finfo(float).tiny, np.finfo(float).max, "give a positive number, as 2.5"
     )
 
 

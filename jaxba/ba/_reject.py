@@ -12,11 +12,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
 
-from jaxba._errors import JaxbaError
 from jaxba.ba._problem import Observations, Problem
-from jaxba.ba._quality import Quality, quality
+from jaxba.ba._quality import Quality, quality, require_mad_factor
 from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
+from jaxba.geometry import require_number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,15 +48,13 @@ def solve_and_reject(problem: Problem, *, rounds: int = 2, mad_factor: float = 2
     >>> bool((cleaned.used & survey.truth.is_outlier).sum() < 0.1 * survey.truth.is_outlier.sum())
     True
     """
-    if rounds < 0:
-        raise JaxbaError(f"rounds {rounds}: give 0 or more.")
-    if mad_factor <= 0:
-        raise JaxbaError(f"mad_factor {mad_factor}: give a positive number, such as 2.5.")
+    require_number("solve_and_reject: rounds", rounds, 0.0, 2.0**31 - 1, "give a whole number, 0 or more", whole=True)
+    require_mad_factor(mad_factor)
     used = np.ones(problem.num_observations, bool)
     solution, used = _solve_with(problem, used, options)
     found = quality(solution.apply(problem), used, mad_factor=mad_factor)
     num_rejected, solutions = [], [solution]
-    for _ in range(rounds):
+    for _ in range(int(rounds)):
         fits = found.error_px <= found.threshold_px
         if np.array_equal(fits, used) or solution.result == "interrupted":
             break

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxba.ba._check import Dropped
 from jaxba.ba._gauge import free_gauge
+from jaxba.ba._plausible import implausible_cameras
 from jaxba.ba._problem import Problem
 from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
 from jaxba.ba._unknowns import Unknowns
@@ -26,6 +27,9 @@ RESULTS = {
 }
 """Names of a solution's status."""
 
+_NOTHING, _GAIN = 1e-12, 1e-8  # shares of the cost: a fall that is rounding, a gain not worth a step
+_ZERO = 1e-16  # of the cost at the start: where pixels are exact, the rest is rounding
+
 _ADVICE = {
     "ftol": "Converged: the cost no longer changes (ftol).",
     "xtol": "Converged: the unknowns no longer change (xtol).",
@@ -34,6 +38,8 @@ _ADVICE = {
     "the input: wrong focal length, wrong matches under a loss that is not robust.",
     "stuck": "Not converged: no step lowers the cost. Look for points at infinity or images with few points; a robust "
     "loss, priors or fixed intrinsics make such problems better posed.",
+    "rounding": "Converged: the optimum is reached to rounding, and no step lowers the cost further. ftol, xtol or "
+    "gtol ask for more digits than there are.",
     "not_finite": "Not started: the cost at the start values is not finite. Some point may lie in a camera's plane.",
     "interrupted": "Interrupted: these are the values reached so far.",
 }
@@ -130,20 +136,47 @@ class Solution(eqx.Module):
 
     @property
     def result(self) -> str:
-        """One of ftol, xtol, gtol (converged), max_nfev, stuck, not_finite, interrupted."""
+        """One of ftol, xtol, gtol, rounding (converged), max_nfev, stuck, not_finite, interrupted.
+
+        A solve inside `jit`, `vmap` or a derivative does not tell `rounding` from `stuck`.
+        """
         if self.report is not None and self.report.interrupted:
             return "interrupted"
-        return RESULTS[int(self.status)]
+        result = RESULTS[int(self.status)]
+        return "rounding" if result == "stuck" and self._is_at_rounding() else result
 
     @property
     def converged(self) -> bool:
         """Whether one of the convergence tests was met."""
-        return self.result in ("ftol", "xtol", "gtol")
+        return self.result in ("ftol", "xtol", "gtol", "rounding")
+
+    def _is_at_rounding(self) -> bool:
+        """Whether even the longest of the steps refused since the cost last fell could have gained next to nothing.
+
+        A step gains at most gradient times length. Where the solver is stuck for another reason, the first steps
+        refused are long, and grow short by damping alone.
+        """
+        history = () if self.report is None else self.report.history
+        cost = max(float(self.final_cost), _ZERO * float(self.initial_cost))
+        least = _NOTHING * cost
+        fell = max((i for i, step in enumerate(history) if step.accepted and step.change > least), default=0)
+        refused = [step for step in history[fell + 1 :] if not step.accepted]
+        return bool(refused) and max(step.gradient * step.step_norm for step in refused) <= _GAIN * cost
 
     @property
     def advice(self) -> str:
-        """Why the solver stopped, and what to do."""
-        return _ADVICE[self.result]
+        """Why the solver stopped, and what to do; also where a camera became what no lens can be."""
+        found = self.implausible_cameras
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        return f"{_ADVICE[self.result]} Not to be used as it is: {found[0]}{more}." if found else _ADVICE[self.result]
+
+    @property
+    def implausible_cameras(self) -> list[str]:
+        """Sentences on cameras that the solver took where no lens can be, such as to a negative focal length.
+
+        Empty for a solve inside `jit`, `vmap` or a derivative.
+        """
+        return [] if self.report is None else implausible_cameras(self.apply(self.report.problem), few=0.0)
 
     def apply(self, problem: Problem) -> Problem:
         """Return the problem with the solution's values as start values."""

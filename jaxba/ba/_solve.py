@@ -20,7 +20,7 @@ from jaxba.ba._descend import descend
 from jaxba.ba._plan import LinearSolver, Plan
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
-from jaxba.ba._solvers import AbstractSchurSolver, SchurDogleg, SchurLevenbergMarquardt
+from jaxba.ba._solvers import AbstractSchurSolver, SchurDogleg, SchurLevenbergMarquardt, require_tolerance
 from jaxba.ba._system import (
     System,
     centred,
@@ -33,7 +33,7 @@ from jaxba.ba._system import (
 )
 from jaxba.ba._traced import solve_traced
 from jaxba.ba._unknowns import Unknowns
-from jaxba.geometry import AbstractLoss, Linear
+from jaxba.geometry import AbstractLoss, Linear, check_loss, require_number
 
 Method = Literal["lm", "dogleg"]
 _SOLVERS: dict[str, type[SchurLevenbergMarquardt] | type[SchurDogleg]] = {
@@ -71,8 +71,9 @@ def solve(
       solver's steps, whose memory grows with their number; reverse mode alone, without bounds.
     - `callback`: called after every step.
 
-    Raises `JaxbaError` for a problem that cannot be solved, naming what is wrong. What is left out instead (points seen
-    once, points behind their camera) is counted in `solution.report.dropped`. Ctrl-C returns what was reached so far.
+    Raises `JaxbaError` for a problem that cannot be solved and for options out of range, naming what is wrong. What is
+    left out instead (points seen once, points behind their camera) is counted in `solution.report.dropped`. Ctrl-C
+    returns what was reached so far.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(8)
@@ -81,17 +82,35 @@ def solve(
     (True, True)
     """
     loss = Linear() if loss is None else loss
-    if method not in _SOLVERS:
-        raise JaxbaError(f"method {method!r}: choose one of {', '.join(_SOLVERS)}.")
-    solver = _SOLVERS[method](rtol=ftol, atol=gtol, xtol=xtol)
-    if adjoint not in get_args(Adjoint):
-        raise JaxbaError(f"adjoint {adjoint!r}: choose one of {', '.join(get_args(Adjoint))}.")
+    check_loss("solve: loss", loss)
+    for name, value, choices in (
+        ("method", method, tuple(_SOLVERS)),
+        ("linear_solver", linear_solver, get_args(LinearSolver)),
+        ("adjoint", adjoint, get_args(Adjoint)),
+        ("dtype", _name_of(dtype), ("float64", "float32")),
+    ):
+        if value not in choices:
+            raise JaxbaError(f"solve: {name} {value!r}: choose one of {', '.join(choices)}.")
+    if is_traced((ftol, xtol, gtol, max_nfev)):
+        raise JaxbaError("solve: ftol, xtol, gtol or max_nfev is traced, as arguments of jit are; give numbers.")
+    require_number("solve: max_nfev", max_nfev, 1.0, 2.0**31 - 1, "give a whole number of steps, 1 or more", whole=True)
+    for name, value in (("ftol", ftol), ("xtol", xtol), ("gtol", gtol)):
+        require_tolerance(f"solve: {name}", value)
+    solver = _SOLVERS[method](rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
+    max_nfev = int(max_nfev)
     if is_traced((problem, loss)):
         return solve_traced(problem, loss, solver, plan, linear_solver, adjoint, max_nfev, callback)
     # OpenBLAS's threads fight with XLA's for the cores (with them a 144 x 144 Cholesky took 204 ms instead of 0.16 ms),
     # so OpenBLAS gets one thread for as long as this runs
     with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
         return _solve_on_host(problem, loss, solver, plan, linear_solver, max_nfev, dtype, callback)
+
+
+def _name_of(dtype: Any) -> str:
+    try:
+        return np.dtype(dtype).name
+    except TypeError:
+        return str(dtype)
 
 
 def _solve_on_host(

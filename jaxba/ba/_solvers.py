@@ -29,6 +29,7 @@ from jaxba.ba._rows import rows_of
 from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, reduce_vector, to_reduced
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
+from jaxba.geometry import require_number
 
 _MIN_RATIO = 1e-3
 # Where the model foretells a decrease this exactly, damping may fall much faster than by Ceres's third: 100 images are
@@ -68,6 +69,11 @@ class Proposal(NamedTuple):
     shortened: Float[Array, ""]
 
 
+def require_tolerance(label: str, value: Any) -> None:
+    """Raise `JaxbaError` for a tolerance that is negative or not finite."""
+    require_number(label, value, 0.0, np.finfo(float).max, "give 0 (never stop for it) or a small positive number")
+
+
 def residuals(unknowns: Unknowns, system: System) -> tuple[Float[Array, "components *rows"], ...]:
     """Return every group's robust residuals `sqrt(rho(s) / s) r`, `s = |r|^2`: their squares sum to twice the cost."""
 
@@ -93,6 +99,12 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
     xtol: eqx.AbstractVar[float]
     norm: eqx.AbstractVar[Callable[[PyTree], Float[Array, ""]]]
     initial_trust: eqx.AbstractVar[float]
+
+    def __check_init__(self) -> None:
+        for name in ("rtol", "atol", "xtol"):
+            require_tolerance(f"{type(self).__name__}: {name}", getattr(self, name))
+        cure = "give a positive number"
+        require_number(f"{type(self).__name__}: initial_trust", self.initial_trust, 1e-16, _MAX_DAMPING, cure)
 
     @abc.abstractmethod
     def propose(self, system: System, unknowns: Unknowns, model: Linearisation, trust: Float[Array, ""]) -> Proposal:

@@ -30,9 +30,10 @@ from jaxba.ba._check import prepare
 from jaxba.ba._gauge import require_gauge
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._problem import AbstractPrior, Observations, Problem
+from jaxba.ba._selection import Selection, selected
 from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
-from jaxba.geometry import AbstractLoss, Barron, Linear
+from jaxba.geometry import AbstractLoss, Barron, Linear, check_loss, require_number
 
 _SHAPES = (-4.0, 2.0)  # of Barron's loss: the range that alpha is learned in
 _HELD_OUT_SIGMAS = 3.0
@@ -62,8 +63,8 @@ def tune(
     problem: Problem,
     *,
     loss: AbstractLoss,
-    learn: Sequence[str] = ("loss scale",),
-    check_points: tuple[Int[np.ndarray, " checks"], Float[np.ndarray, "checks 3"]] | None = None,
+    learn: Sequence[str] | np.ndarray = ("loss scale",),
+    check_points: tuple[Selection, Float[np.ndarray, "n 3"]] | None = None,
     hold_out: float | None = None,
     steps: int = 20,
     learning_rate: float = 0.2,
@@ -76,7 +77,7 @@ def tune(
 
     - `loss`: with its start values. `learn`: of `loss scale`, `loss shape` (of `Barron`), `pixel sigmas`, and
       `position sigmas` and the like for each prior.
-    - `check_points`: indices and true coordinates of points whose coordinates the fit does not know, or
+    - `check_points`: indices (or a mask) and true coordinates of points whose coordinates the fit does not know, or
     - `hold_out`: the share of the observations to leave out of the fit, fewer where points would not keep two each.
     - `optimizer`: of optax; `optax.adam(learning_rate)` if None.
     - `starts`: how many descents, from start values spread by a factor of e, at once (`vmap`). `seed`: of the starts
@@ -101,8 +102,12 @@ def tune(
         raise JaxbaError("tune needs optax, which is not installed: pip install 'jaxba[tune]'.") from error
     if (check_points is None) == (hold_out is None):
         raise JaxbaError("tune: give check_points or hold_out, one of them: the data to be judged by.")
-    if steps < 1 or starts < 1:
-        raise JaxbaError(f"tune: steps={steps}, starts={starts}; both are 1 or more.")
+    for name, count, least in (("steps", steps, 1.0), ("starts", starts, 1.0), ("seed", seed, 0.0)):
+        cure = f"give a whole number, {least:g} or more"
+        require_number(f"tune: {name}", count, least, 2.0**31 - 1, cure, whole=True)
+    require_number("tune: learning_rate", learning_rate, 1e-12, 1e3, "give a positive number, such as 0.2")
+    check_loss("tune: loss", loss)
+    learn = [learn] if isinstance(learn, str) else [str(name) for name in learn]
     _check_names(problem, loss, learn)
     problem = prepare(problem).problem
     require_gauge(problem, "Tuning")
@@ -251,10 +256,12 @@ def _start(values: Any, start: int) -> Any:
 
 
 def _check_point_score(
-    problem: Problem, index: Int[np.ndarray, " checks"], xyz: Float[np.ndarray, "checks 3"]
+    problem: Problem, index: Selection, xyz: Float[np.ndarray, "n 3"]
 ) -> Callable[[Solution], Float[Array, ""]]:
+    chosen = selected("tune: check_points", index, problem.num_points, "points")
     index, xyz = np.asarray(index), np.asarray(xyz, float)
-    if len(index) == 0 or index.min() < 0 or index.max() >= problem.num_points or xyz.shape != (len(index), 3):
+    index = np.flatnonzero(chosen) if index.dtype == bool else index.reshape(-1)
+    if len(index) == 0 or xyz.shape != (len(index), 3):
         raise JaxbaError(
             f"tune: check_points of {index.shape} indices and {xyz.shape} coordinates; give one index below "
             f"{problem.num_points} and x, y, z for each."

@@ -12,9 +12,13 @@ from typing import Any
 import numpy as np
 
 from jaxba._errors import JaxbaError
+from jaxba.ba._plausible import implausible_cameras
 from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.geometry import check_loss
 
 _QUATERNION_NORM = 1e-3  # files round quaternions to a few digits; more than this is a mistake
+
+_LARGEST = 1e30  # of any number, and of one over any sigma: the fourth power is finite in float64
 
 _Label = Callable[[int], str]
 
@@ -76,6 +80,9 @@ def validate(problem: Problem) -> None:
         raise JaxbaError("Nothing is free, so there is nothing to adjust. Free the poses, points or intrinsics.")
     if sizes["observations"] == 0:
         raise JaxbaError("observations are empty; an adjustment needs points measured in images.")
+    implausible = implausible_cameras(problem)
+    if implausible:
+        raise JaxbaError(f"cameras: {implausible[0]}{_more(np.array(implausible))}.")
 
 
 def _length(value: Any) -> int:
@@ -108,12 +115,42 @@ def _check_finite(field: str, value: Any, label: _Label) -> None:
     array = np.asarray(value)
     if not np.isfinite(array).all():
         _raise_entry(field, array, ~np.isfinite(array), label, "give a finite value or leave the entry out")
+    if np.max(np.abs(array), initial=0.0) > _LARGEST:
+        cure = f"correct it or leave the entry out: beyond {_LARGEST:g}, squares are no longer finite"
+        _raise_entry(field, array, np.abs(array) > _LARGEST, label, cure)
 
 
 def _check_positive(field: str, value: Any, label: _Label) -> None:
     array = np.asarray(value)
     if not (array > 0).all():
         _raise_entry(field, array, ~(array > 0), label, "a sigma must be positive")
+    absurd = (array < 1 / _LARGEST) | (np.isfinite(array) & (array > _LARGEST))
+    if absurd.any():
+        cure = f"give a sigma from {1 / _LARGEST:g} to {_LARGEST:g}"
+        _raise_entry(field, array, absurd, label, cure)
+
+
+def _check_precision(field: str, value: np.ndarray, std: np.ndarray, label: _Label) -> None:
+    """Refuse coordinates that have been float32 where its steps are coarser than their sigmas: 0.5 m at 4.6e6 m.
+
+    What is float64 by now has been float32 where every coordinate of an axis is one that float32 has: of other numbers
+    one in 500 million is. Whole numbers are all that an axis of true ones may hold by chance.
+    """
+    if not value.size or not np.max(np.abs(value)) <= _LARGEST or value.shape != std.shape:
+        return
+    step = np.spacing(np.abs(value).astype(np.float32)).astype(float)
+    is_single = np.ones(value.shape[1], bool)
+    if value.dtype == np.float64:
+        is_single = np.all(value == value.astype(np.float32), axis=0)
+        is_single &= np.any(value != np.round(value), axis=0) | np.all(step >= 2, axis=0)
+    coarse = is_single & (step > std)
+    if coarse.any():
+        row, more = int(np.argwhere(coarse)[0][0]), _more(np.unique(np.argwhere(coarse)[:, 0]))
+        raise JaxbaError(
+            f"{field}: {label(row)}: {value[coarse][0]:.9g}{more} is rounded to steps of {step[coarse][0]:g} m, as "
+            f"float32 is there, coarser than its sigma of {std[coarse][0]:g} m; subtract an origin near the block in "
+            "float64 before, or give float64."
+        )
 
 
 def _check_quaternion(field: str, value: Any, label: _Label) -> None:
@@ -182,6 +219,7 @@ def _check_bounds(problem: Problem) -> None:
 
 def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int]) -> None:
     """Check any prior from its fields: `<kind>_index` refers to a kind, `std...` is a sigma, all else are values."""
+    check_loss(f"prior {prior.name}: loss", prior.loss)
     fields = [f for f in dataclasses.fields(prior) if f.name != "loss"]
     values = {f.name: np.asarray(getattr(prior, f.name)) for f in fields}
     sizes = {**sizes, "rows": _length(values[fields[0].name])}
@@ -203,6 +241,8 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
             continue
         name, value = f"prior {prior.name}: {field.name}", values[field.name]
         _check_shape(name, value, _dims(field.type), sizes)
+        if field.name == "xyz":
+            _check_precision(name, value, values["std_m"], label)
         if field.name.startswith("std"):
             _check_positive(f"{name} (infinite where nothing is known)", value, label)
         elif field.name == "quaternion":

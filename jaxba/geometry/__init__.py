@@ -22,7 +22,9 @@ from jaxba.geometry._losses import (
     Linear,
     SoftL1,
     Tukey,
+    check_loss,
 )
+from jaxba.geometry._numbers import require_number
 from jaxba.geometry._pose import Pose, se3_exp, se3_log
 from jaxba.geometry._rotation import (
     hat,
@@ -41,7 +43,7 @@ from jaxba.geometry._triangulate import Triangulation, refine_point, triangulate
 __all__ = [
     "BAL", "CAMERAS", "LOSSES", "AbstractCamera", "AbstractLoss", "Arctan", "Barron", "Cauchy", "GemanMcClure", "Huber",
     "Linear", "OpenCV", "OpenCVFisheye", "Pinhole", "Pose", "Radial", "SimplePinhole", "SimpleRadial", "SoftL1",
-    "Triangulation", "Tukey", "hat", "matrix_from_quaternion", "quaternion_conjugate", "quaternion_exp",
-    "quaternion_from_matrix", "quaternion_log", "quaternion_multiply", "refine_point", "se3_exp", "se3_log", "so3_exp",
-    "so3_left_jacobian_inverse", "so3_log", "triangulate", "triangulate_two_view",
+    "Triangulation", "Tukey", "check_loss", "hat", "matrix_from_quaternion", "quaternion_conjugate", "quaternion_exp",
+    "quaternion_from_matrix", "quaternion_log", "quaternion_multiply", "refine_point", "require_number", "se3_exp",
+    "se3_log", "so3_exp", "so3_left_jacobian_inverse", "so3_log", "triangulate", "triangulate_two_view",
 ]  # fmt: skip

@@ -6,18 +6,33 @@ residuals count as in least squares.
 """
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import Float
+
+from jaxba._errors import JaxbaError
+from jaxba.geometry._numbers import require_number
+
+_LEAST_SCALE, _LARGEST_SCALE = 1e-18, 1e18  # their squares, and those over them, are finite in float32
 
 
 class AbstractLoss(eqx.Module):
-    """Robust loss; `f_scale` is in units of the residual's sigma."""
+    """Robust loss; `f_scale` is in units of the residual's sigma.
+
+    A scale that is not positive and finite is refused with a `JaxbaError`, here and by everything that takes a loss.
+    """
 
     f_scale: eqx.AbstractVar[Float[Array, ""] | float]
+
+    def __check_init__(self) -> None:
+        if not any(isinstance(leaf, Tracer) or np.ndim(leaf) for leaf in jax.tree.leaves(self)):
+            _check_numbers("loss", self, most_alpha=np.finfo(float).max)  # a loss of arrays is one for `vmap`
 
     @abc.abstractmethod
     def rho(self, z: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -138,6 +153,26 @@ def _expm1(x: Array) -> Array:
 def _expm1_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # jax's own derivative, expm1(x) + 1, loses the digits of the small weights that outliers get
     return jnp.expm1(primals[0]), jnp.exp(primals[0]) * tangents[0]
+
+
+def check_loss(label: str, loss: Any) -> None:
+    """Raise `JaxbaError` where a loss, called `label` in messages, is none that an adjustment can use.
+
+    Traced values pass, as they do in the constructor of a loss; values put in later are found here, and a shape over 2,
+    under which large residuals count more than in least squares.
+    """
+    if not isinstance(loss, AbstractLoss):
+        raise JaxbaError(f"{label} is {loss!r}; give a loss, such as Huber(f_scale=1.0).")
+    _check_numbers(label, loss, most_alpha=2.0)
+
+
+def _check_numbers(label: str, loss: AbstractLoss, *, most_alpha: float) -> None:
+    name = type(loss).__name__
+    cure = f"give a positive number of sigmas, such as 1 ({_LEAST_SCALE:g} to {_LARGEST_SCALE:g})"
+    require_number(f"{label} {name}: f_scale", loss.f_scale, _LEAST_SCALE, _LARGEST_SCALE, cure)
+    if isinstance(loss, Barron):
+        cure = "give 2 (least squares) or less, down to -inf"
+        require_number(f"{label} {name}: alpha", loss.alpha, -np.inf, most_alpha, cure)
 
 
 LOSSES: dict[str, type[AbstractLoss]] = {

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.ba import PRIORS, AbstractPrior, Free, Observations, Problem
-from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Pose
+from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Pose, check_loss
 from jaxba.io._atomic import write_atomically
 from jaxba.io._check import check_arrays, check_names
 from jaxba.io._npz import read_npz, write_npz
@@ -106,6 +106,12 @@ def _checked(arrays: Mapping[str, np.ndarray], label: str) -> dict[str, np.ndarr
                 raise JaxbaError(
                     f"{label}: {spec.name} is given, but {loss} has {', '.join(parameters)} only; remove the array."
                 )
+        for parameter in parameters:
+            array = f"prior_{name}_loss_{parameter}"
+            try:
+                check_loss("loss", LOSSES[loss](**{parameter: checked[array].item()}))
+            except JaxbaError as error:
+                raise JaxbaError(f"{label}: {array}: {error}") from error
     return checked
 
 

@@ -25,6 +25,7 @@ DRONE_CAMERA = OpenCV(fx=3652.0, fy=3649.0, cx=2748.5, cy=1816.2, k1=-0.045, k2=
 
 
 _FOCAL, _CENTER = ("f", "fx", "fy"), ("cx", "cy")
+_MOST = 1e9  # of counts and metres: what lies beyond is a mistake
 
 
 @dataclass(frozen=True)
@@ -132,14 +133,26 @@ def uav_block(
     (12, 802, (802, 3))
     """
     for name, value, low, high in (
-        ("num_images", num_images, 2, np.inf),
+        ("num_images", num_images, 2, _MOST),
         ("num_cameras", num_cameras, 1, num_images),
         ("num_lines", 1 if num_lines is None else num_lines, 1, num_images),
+        ("height_m", height_m, 1e-3, _MOST),
         ("forward_overlap", forward_overlap, 0.0, 0.99),
         ("side_overlap", side_overlap, 0.0, 0.99),
+        ("position_jitter_m", position_jitter_m, 0.0, _MOST),
+        ("attitude_jitter_rad", attitude_jitter_rad, 0.0, np.pi),
         ("terrain_relief_m", terrain_relief_m, 0.0, height_m),
-        ("mean_track_length", mean_track_length, 2.0, np.inf),
-        ("pixel_std_px", pixel_std_px, 0.0, np.inf),
+        ("points_per_image", points_per_image, 1.0, _MOST),
+        ("mean_track_length", mean_track_length, 2.0, _MOST),
+        ("num_control", num_control, 0, _MOST),
+        ("num_check", num_check, 0, _MOST),
+        ("pixel_std_px", pixel_std_px, 0.0, _MOST),
+        ("attitude_error_rad", attitude_error_rad, 0.0, np.pi),
+        ("position_error_m", position_error_m, 0.0, _MOST),
+        ("focal_error", focal_error, -0.9, 10.0),
+        ("point_error_m", point_error_m, 0.0, _MOST),
+        ("seed", seed, 0, np.inf),
+        *((f"camera.{name}", getattr(camera, name), 1.0, _MOST) for name in _FOCAL if name in camera.parameter_names()),
         ("outlier_fraction", outlier_fraction, 0.0, 1.0),
         ("gnss_outlier_fraction", gnss_outlier_fraction, 0.0, 1.0),
     ):

@@ -199,12 +199,12 @@ def two_views(camera: Any, points: Any) -> Problem:
 
 
 def test_points_behind_the_camera_are_left_out():
-    problem = two_views(Pinhole(100.0, 100.0, 50.0, 50.0), [[0, 0, 5], [1, 0, -5], [0, 1, 0], [1, 1, 8]])
-    dropped = prepare(problem).dropped
-    np.testing.assert_array_equal(np.flatnonzero(dropped.reason == Reason.BEHIND), [1, 2, 5, 6])
+    problem = two_views(Pinhole(100.0, 100.0, 50.0, 50.0), [[0, 0, 5], [1, 0, -5], [0, 1, 0], [1, 1, 8], [2, 1, 6]])
+    dropped = prepare(problem.fix(intrinsics=True)).dropped  # three points do for two poses
+    np.testing.assert_array_equal(np.flatnonzero(dropped.reason == Reason.BEHIND), [1, 2, 6, 7])
     assert dropped.points.tolist() == [1, 2]
     assert dropped.summary() == [
-        "4 observations of points behind the camera left out (first: 1, 2, 5, ...)",
+        "4 observations of points behind the camera left out (first: 1, 2, 6, ...)",
         "2 points seen fewer than twice after that left out (first: 1, 2)",
     ]
 
@@ -219,4 +219,31 @@ def test_model_that_sees_behind_keeps_what_has_a_pixel():
 def test_block_that_looks_the_wrong_way_is_an_error():
     problem = two_views(Pinhole(100.0, 100.0, 50.0, 50.0), [[0, 0, -5], [1, 0, -5]])
     with pytest.raises(JaxbaError, match=r"No observation is left of 4: 4 are of points behind .* give cam_from_world"):
+        prepare(problem)
+
+
+@pytest.mark.parametrize("through", ["float32", "float32, then float64", "float64", "whole metres"])
+@pytest.mark.parametrize(
+    ("offset_m", "std_m", "step_m"), [(4.6e6, 0.02, 0.5), (4.6e6, 1.0, 0), (5e5, 0.02, 0.03125), (300.0, 0.02, 0)]
+)
+def test_coordinates_rounded_by_more_than_their_sigma_are_refused(
+    block: Problem, through: str, offset_m: float, std_m: float, step_m: float
+):
+    given = position(block)
+    xyz = np.asarray(given.xyz) + offset_m
+    if through.startswith("float32"):
+        xyz = xyz.astype(np.float32)
+    if through == "float32, then float64":
+        xyz = xyz.astype(float)
+    if through == "whole metres":
+        xyz = np.round(xyz)
+    prior = dataclasses.replace(given, xyz=xyz, std_m=np.full(xyz.shape, std_m))
+    problem = dataclasses.replace(block, priors=(prior, *block.priors[1:]))
+    if step_m and through.startswith("float32"):
+        said = (
+            rf"prior position: xyz.*: image 0 \(DJI_0000.JPG\): .* steps of {step_m:g} m, .* sigma of {std_m:g} m; sub"
+        )
+        with pytest.raises(JaxbaError, match=said):
+            prepare(problem)
+    else:
         prepare(problem)

@@ -202,11 +202,14 @@ def test_block_without_gauge_is_refused():
 
 
 def test_unknown_without_measurements_is_named():
+    """Three points that an image shares with one other each give its pose three rows, with the points unknown."""
     problem = small_block(num_control=4)
     names = tuple(f"{i}.jpg" for i in range(12))
     seen, prior = problem.observations, problem.priors[0]
-    mine = np.flatnonzero(seen.image_index == 4)
-    keep = np.setdiff1d(np.arange(problem.num_observations), mine[2:])
+    mine = np.flatnonzero((seen.image_index == 4) & (seen.point_index > 20))
+    others = [np.flatnonzero((seen.point_index == p) & (seen.image_index != 4))[1:] for p in seen.point_index[mine[:3]]]
+    away = np.setdiff1d(np.flatnonzero(seen.image_index == 4), mine[:3])
+    keep = np.setdiff1d(np.arange(problem.num_observations), np.concatenate([away, *others]))
     std_m = np.array(prior.std_m)
     std_m[4] = np.inf
     loose = dataclasses.replace(

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from small_problems import RADIAL, small_problem
 
 from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem, free_gauge
@@ -241,3 +242,50 @@ def test_refusal_says_what_is_free_and_what_to_do():
     require_gauge(problem.fix(poses=[0, 7]), "Covariance")
     with pytest.raises(JaxbaError, match="Hold the lever arm fixed"):
         require_gauge(given(problem.fix(poses=[0, 7]), lever_arm=True), "Covariance")
+
+
+ABSURD = (0.0, np.nan, np.inf, 1e308, 1e200, 1e31, 1e30, 1e20, 1e12, 1e-12, 1e-20, 1e-30, 1e-31, 1e-308, 5e-324)
+
+
+def test_absurd_numbers_are_refused_or_judged():
+    """Any number of a problem, or all of an array, is set to or multiplied by an absurd one: nothing else is raised."""
+    rng = np.random.default_rng(0)
+    leaves, tree = jax.tree.flatten(small_problem(RADIAL, lever_arm=True))
+    numbers = [i for i, leaf in enumerate(leaves) if np.asarray(leaf).dtype.kind == "f"]
+    judged = refused = 0
+    for _ in range(150):
+        i, changed = rng.choice(numbers), list(leaves)
+        value = rng.choice(ABSURD) * rng.choice([1, 1, 1, -1])
+        array = changed[i] = np.array(leaves[i])
+        where = ... if rng.random() < 0.5 else np.unravel_index(rng.integers(array.size), array.shape)
+        with np.errstate(all="ignore"):
+            array[where] = value if rng.random() < 0.5 else array[where] * value
+        problem = jax.tree.unflatten(tree, changed)
+        try:
+            free_gauge(problem.fix(poses=[0] if rng.random() < 0.5 else []))
+            judged += 1
+        except JaxbaError:
+            refused += 1
+    assert min(judged, refused) > 20
+
+
+@pytest.mark.parametrize("std_m", [1e-30, 1e-12, 1e12, 1e30])
+def test_the_unit_of_a_sigma_does_not_matter(std_m: float):
+    survey = uav_block(8)
+    assert free_gauge(eqx.tree_at(lambda p: p.priors[0].std_m, survey.problem, np.full((8, 3), std_m))) == ()
+
+
+@pytest.mark.parametrize(
+    ("std_m", "message"),
+    [(1e-200, "has 1e-200 .*; give a sigma from 1e-30 to 1e"), (1e200, "has 1e.200 .*; give a sigma from 1e-30 to 1e")],
+)
+def test_an_absurd_sigma_is_named(std_m: float, message: str):
+    survey = uav_block(8)
+    with pytest.raises(JaxbaError, match=f"prior position: std_m .*: image 0 {message}"):
+        free_gauge(eqx.tree_at(lambda p: p.priors[0].std_m, survey.problem, np.full((8, 3), std_m)))
+
+
+def test_an_absurd_coordinate_is_named():
+    problem = block()
+    with pytest.raises(JaxbaError, match=r"points: point 0 has 1e\+308 \(and \d+ more\); correct it .* beyond 1e\+30"):
+        free_gauge(dataclasses.replace(problem, points=np.full_like(problem.points, 1e308)))

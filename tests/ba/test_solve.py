@@ -1,5 +1,6 @@
 """`solve` as users call it: published costs, Ceres, jit and vmap, interruption, what is left out."""
 
+import dataclasses
 from pathlib import Path
 
 import equinox as eqx
@@ -214,3 +215,22 @@ def with_far_points(problem: jaxba.Problem, distance_m: float, times: float, cou
     start = np.concatenate([problem.points, centers[0] + times * (points - centers[0])])
     free = np.concatenate([problem.free.points, np.ones(count, bool)])
     return eqx.tree_at(lambda p: (p.points, p.observations, p.free.points), problem, (start, observations, free))
+
+
+@pytest.mark.parametrize("tolerances", [{"gtol": 1e-13}, {"gtol": 0.0}], ids=str)
+def test_an_optimum_reached_to_rounding_is_called_one(tolerances: dict[str, float]) -> None:
+    solution = jaxba.solve(PROBLEM, loss=LOSS, ftol=0.0, xtol=0.0, **tolerances)
+    assert solution.result == "rounding" and solution.converged
+    assert solution.advice.startswith("Converged: the optimum is reached to rounding")
+    assert solution.final_cost == pytest.approx(float(jaxba.solve(PROBLEM, loss=LOSS).final_cost), rel=1e-7)
+
+
+def test_a_solve_whose_first_refused_steps_are_long_is_stuck() -> None:
+    solution = jaxba.solve(PROBLEM, loss=LOSS, ftol=0.0, xtol=0.0, gtol=0.0)
+    report = solution.report
+    last = max(step.step for step in report.history if step.accepted and step.change > 0)
+    first = next(i for i, step in enumerate(report.history) if not step.accepted and i > last - 20)
+    long = dataclasses.replace(report.history[first], accepted=False, step_norm=1e6, gradient=1.0)
+    history = (*report.history[: first + 1], *[long] * 3, *report.history[-5:])
+    stuck = dataclasses.replace(solution, report=dataclasses.replace(report, history=history))
+    assert stuck.result == "stuck" and not stuck.converged and "points at infinity" in stuck.advice

@@ -1,14 +1,31 @@
 """Losses against scipy, published formulas in 50 digits, and central differences."""
 
 from decimal import Decimal, localcontext
+from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from jax import Array
 from quick_jit import quick_jit
 
-from jaxba.geometry import LOSSES, AbstractLoss, Arctan, Barron, Cauchy, GemanMcClure, Huber, Linear, SoftL1, Tukey
+from jaxba._errors import JaxbaError
+from jaxba.geometry import (
+    LOSSES,
+    AbstractLoss,
+    Arctan,
+    Barron,
+    Cauchy,
+    GemanMcClure,
+    Huber,
+    Linear,
+    SoftL1,
+    Tukey,
+    check_loss,
+)
 
 # squared residuals from nothing to a gross outlier, beside the corner of Huber and Tukey at 1
 SQUARED = np.array([0.0, 1e-12, 1e-3, 0.4, 0.999, 1.001, 2.5, 30.0, 1e4, 1e8])
@@ -141,3 +158,55 @@ def test_barron_has_finite_derivatives_by_alpha_where_its_formula_is_0_over_0():
 def test_losses_have_derivatives_that_match_central_difference(loss, assert_derivative):
     batch = np.array([[s, f] for s in (0.01, 0.4, 2.5, 30.0) for f in (1.0, 1.3)])
     assert_derivative(lambda p: loss(f_scale=p[1])(p[0]), batch)
+
+
+WITHIN = "give a positive number of sigmas"
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf, -np.inf, 1e-200, 1e200, np.float64(0), jnp.array(-2.0)])
+def test_a_scale_that_is_none_is_named(name: str, scale: Any):
+    with pytest.raises(JaxbaError, match=f"{LOSSES[name].__name__}: f_scale is .*; {WITHIN}"):
+        LOSSES[name](f_scale=scale)
+
+
+@pytest.mark.parametrize("scale", ["1.0", None, True, 1j], ids=str)
+def test_a_scale_of_another_kind_is_named(scale: Any):
+    with pytest.raises(JaxbaError, match=f"Huber: f_scale is .*no number; {WITHIN}"):
+        check_loss("loss", _with_scale(scale))
+
+
+@pytest.mark.parametrize("alpha", [np.nan, np.inf, 2.0001, 3.0])
+def test_a_shape_that_is_none_is_named(alpha: float):
+    with pytest.raises(JaxbaError, match=f"Barron: alpha is {alpha:g}; give 2 .least squares. or less"):
+        check_loss("solve: loss", Barron(alpha=alpha))
+
+
+@pytest.mark.parametrize(("loss", "text"), [("huber", "'huber'"), (Huber, "class"), (None, "None"), (1.0, "1.0")])
+def test_what_is_no_loss_is_named(loss: Any, text: str):
+    with pytest.raises(JaxbaError, match=f"^solve: loss is .*{text}.*; give a loss, such as Huber"):
+        check_loss("solve: loss", loss)
+
+
+def test_a_value_put_in_later_is_found():
+    with pytest.raises(JaxbaError, match="f_scale is 0"):
+        check_loss("loss", _with_scale(0.0))
+    with pytest.raises(JaxbaError, match=r"f_scale has shape \(2,\); it is one number"):
+        check_loss("loss", _with_scale(np.ones(2)))
+
+
+def test_traced_and_batched_scales_are_losses():
+    def cost(scale: Array) -> Array:
+        loss = Barron(alpha=scale - 1, f_scale=scale)
+        check_loss("loss", loss)
+        return loss(jnp.array(4.0))
+
+    scales = jnp.array([1.0, 2.0])
+    batch = jax.vmap(lambda scale: Barron(alpha=scale - 1, f_scale=scale))(scales)
+    each = jax.vmap(lambda loss: loss(jnp.array(4.0)))(batch)
+    np.testing.assert_allclose(each, jax.vmap(cost)(scales), rtol=1e-6)
+    assert np.isfinite(jax.grad(cost)(2.0))
+
+
+def _with_scale(scale: Any) -> Huber:
+    return eqx.tree_at(lambda loss: loss.f_scale, Huber(), scale, is_leaf=lambda leaf: leaf is None)

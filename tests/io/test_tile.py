@@ -208,6 +208,16 @@ POSITION = {
         ({"prior_position_loss": "huber"}, "missing, add them: prior_position_image_index"),
         (POSITION | {"prior_position_loss": "l1"}, "prior_position_loss is 'l1'; use one of linear, soft_l1"),
         (POSITION | {"prior_position_loss_alpha": 1.0}, "loss_alpha is given, but linear has f_scale only"),
+        *(
+            (POSITION | {"prior_position_loss": "cauchy", "prior_position_loss_f_scale": scale},
+             f"prior_position_loss_f_scale: loss Cauchy: f_scale is {text}; give a positive number of sigmas")
+            for scale, text in ((0.0, "0"), (-1.0, "-1"), (np.nan, "nan"), (np.inf, "inf"))
+        ),
+        *(
+            (POSITION | {"prior_position_loss": "barron", "prior_position_loss_alpha": alpha},
+             f"prior_position_loss_alpha: loss Barron: alpha is {text}; give 2")
+            for alpha, text in ((2.5, "2.5"), (np.nan, "nan"), (np.inf, "inf"))
+        ),
         (POSITION | {"prior_position_image_index": [2]}, r"image_index\[0\] is 2, but images go from 0 to 1"),
         (POSITION | {"prior_position_xyz": np.ones((2, 3))}, "with 1 position_rows by prior_position_image_index"),
     ],

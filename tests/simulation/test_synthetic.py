@@ -209,3 +209,28 @@ def test_each_image_can_have_its_own_camera() -> None:
 def test_impossible_blocks_are_refused_with_the_cure(options: dict, message: str) -> None:
     with pytest.raises(JaxbaError, match=message):
         uav_block(12, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("height_m", 0.0),
+        ("height_m", -100.0),
+        ("position_jitter_m", np.nan),
+        ("attitude_jitter_rad", 10.0),
+        ("points_per_image", np.inf),
+        ("pixel_std_px", np.nan),
+        ("num_control", -1),
+        ("focal_error", -1.0),
+        ("point_error_m", -2.0),
+        ("seed", -1),
+    ],
+)
+def test_an_option_out_of_range_is_named(name: str, value: float):
+    with pytest.raises(JaxbaError, match=f"{name}={value} is out of range; choose it from"):
+        uav_block(8, **{name: value})
+
+
+def test_a_negative_focal_length_is_named():
+    with pytest.raises(JaxbaError, match=r"camera.f=-900.0 is out of range"):
+        uav_block(8, camera=Radial(-900.0, 0.0, 0.0, 0.0, 0.0))

@@ -12,8 +12,10 @@ from jaxtyping import Float
 from pyproj import CRS, Transformer
 from pyproj.enums import TransformDirection
 
+from jaxba._crs_text import authority_code, horizontal_part
 from jaxba._errors import JaxbaError
-from jaxba.geo._crs import authority_code, describe, horizontal_part, parse_crs, refuse_wrong_place, utm_zone
+from jaxba.geo._crs import describe, parse_crs
+from jaxba.geo._extent import refuse_wrong_place
 from jaxba.geo._heights import KINDS, height_step, vertical_crs
 from jaxba.geo._positions import to_wgs84
 
@@ -82,7 +84,7 @@ def surveyed_points(
     datum, declared = _datum(stated, height_datum, photos_datum, bool(np.isfinite(height).any()), name, notes)
     return Surveyed(
         longitude_deg=lon, latitude_deg=lat, height_m=height, height_datum=datum, declared=declared,
-        crs=_code_of(crs[0], lon, lat) if len(crs) else "", notes=tuple(notes),
+        crs=(authority_code(parse_crs(crs[0])) or crs[0]) if len(crs) else "", notes=tuple(notes),
     )  # fmt: skip
 
 
@@ -205,12 +207,3 @@ def _datum(
 def _above(datum: str) -> str:
     own = vertical_crs(datum, "height datum")
     return KINDS[datum] if own is None else f"{own.name} ({datum})"
-
-
-def _code_of(text: str, lon: Float[np.ndarray, " n"], lat: Float[np.ndarray, " n"]) -> str:
-    """Return the code of a CRS: a PROJ string such as that of ODM's lists says the same as a UTM zone's."""
-    crs = parse_crs(text)
-    zone = utm_zone(float(np.median(lon)), float(np.median(lat)))
-    if authority_code(crs) is None and zone.equals(crs, ignore_axis_order=True):
-        return authority_code(zone) or text
-    return authority_code(crs) or text

@@ -13,8 +13,9 @@ from typing import Literal
 from pyproj import CRS
 from pyproj.database import get_units_map
 
+from jaxba._crs_text import authority_code
 from jaxba._errors import JaxbaError
-from jaxba.geo._crs import authority_code, describe, parse_crs
+from jaxba.geo._crs import describe, parse_crs
 from jaxba.geo._operation import Operation, grid_cure, operations
 
 KINDS = {

@@ -102,9 +102,7 @@ def crs_of_comment(comment: str) -> str | None:
     text = re.sub(r"^(crs|srs|epsg)\s*[:=]\s*", "", comment, flags=re.IGNORECASE)
     if re.fullmatch(r"\d+(\+\d+)?", text):
         return f"EPSG:{text}"
-    is_crs = re.match(
-        r"(EPSG|ESRI|OGC|IGNF):|\+?(proj|init)=|\+\w+=|WGS|(PROJ|GEO|COMP|BOUND)\w*\[", text, re.IGNORECASE
-    )
+    is_crs = re.match(r"(EPSG|ESRI|OGC|IGNF):|\+\w+=|init=|WGS|(PROJ|GEO|COMP|BOUND)\w*\[", text, re.IGNORECASE)
     return text if is_crs else None
 
 

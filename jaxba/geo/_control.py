@@ -9,15 +9,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from pyproj.enums import TransformDirection
 
+from jaxba._crs_text import authority_code, horizontal_part
 from jaxba._errors import JaxbaError
-from jaxba.geo._crs import authority_code, describe, horizontal_part, parse_crs, refuse_wrong_place, utm_zone
-from jaxba.geo._heights import KINDS, height_step, vertical_crs
+from jaxba.geo._crs import describe, parse_crs
+from jaxba.geo._extent import refuse_wrong_place
+from jaxba.geo._heights import KINDS, height_step, list_heights, vertical_crs
 from jaxba.geo._positions import to_wgs84
+from jaxba.geo._readings import rough_places, would_fit
 
 AS_PHOTOS = "as_photos"
+NEAR_M = 5000.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,12 +49,14 @@ def surveyed_points(
     name: str,
     height_datum: str = AS_PHOTOS,
     photos_datum: str | None = None,
+    near: tuple[float, float] | None = None,
 ) -> Surveyed:
     """Return surveyed points on WGS 84; each CRS must hold its points.
 
     - `crs`: of each point. `xyz`: east or longitude first; z NaN where none was measured. `name`: of the list.
     - `height_datum`: what heights are above where the CRS does not say so; `as_photos`: the same as the photos'.
     - `photos_datum`: None where no photo has a height.
+    - `near`: longitude and latitude of the photos, for messages that say what would bring the points there.
 
     Raises `JaxbaError` for a CRS that is unknown or does not hold the points, and for heights above several surfaces.
 
@@ -66,23 +72,20 @@ def surveyed_points(
     for text in sorted(set(crs)):
         rows = np.array([k for k, own in enumerate(crs) if own == text])
         label = f"{name}: CRS"
+        _refuse_elsewhere(text, xyz[rows], name, near)
         lon[rows], lat[rows], found = to_wgs84(text, xyz[rows, 0], xyz[rows, 1], label, "control")
         notes += found
-        parsed = parse_crs(text, label)
-        _refuse_elsewhere(parsed, lon[rows], lat[rows], xyz[rows], name)
-        unit, unit_m, own = _vertical(parsed)
-        height[rows] = unit_m * xyz[rows, 2]
+        height[rows], own, found = list_heights(text, xyz[rows, 2], name)
+        notes += found
         if own is not None and np.isfinite(height[rows]).any():
             stated[own] = text
-        if unit_m != 1 and own is None and np.isfinite(height[rows]).any():
-            notes.append(f"{name}: {text} does not say the unit of z; it is taken for that of x and y, {unit}.")
     if len(stated) > 1:
         both = " and ".join(f"{_above(datum)} ({text})" for datum, text in stated.items())
         raise JaxbaError(f"{name}: heights are above several surfaces, {both}; give all of them above one.")
     datum, declared = _datum(stated, height_datum, photos_datum, bool(np.isfinite(height).any()), name, notes)
     return Surveyed(
         longitude_deg=lon, latitude_deg=lat, height_m=height, height_datum=datum, declared=declared,
-        crs=_code_of(crs[0], lon, lat) if len(crs) else "", notes=tuple(notes),
+        crs=(authority_code(parse_crs(crs[0])) or crs[0]) if len(crs) else "", notes=tuple(notes),
     )  # fmt: skip
 
 
@@ -124,57 +127,30 @@ def heights_above(
     return turned, [f"{differ}: control's are turned into the photos' by '{step.operation.name}' ({change:+.3f} m)."]
 
 
-def elsewhere(
-    crs: str, xy: Float[np.ndarray, "points 2"]
-) -> list[tuple[str, Float[np.ndarray, " points"], Float[np.ndarray, " points"]]]:
-    """Return where points would lie with usual mistakes undone: axes swapped, a neighbouring UTM zone; in words."""
-    parsed = horizontal_part(parse_crs(crs))
-    found = [("x and y swapped", *_rough(parsed, xy[:, ::-1]))]
-    zone = parsed.utm_zone
-    if zone is not None:
-        number, side = int(zone[:-1]), zone[-1]
-        others = [((number - 2) % 60 + 1, side), (number % 60 + 1, side), (number, "S" if side == "N" else "N")]
-        for other, south in others:
-            code = (32600 if south == "N" else 32700) + other
-            found.append((f"UTM zone {other}{south} (EPSG:{code})", *_rough(CRS.from_epsg(code), xy)))
-    return [(words, lon, lat) for words, lon, lat in found if np.isfinite(lon).all() and np.isfinite(lat).all()]
-
-
-def _rough(crs: CRS, xy: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return longitude and latitude in the CRS's own datum: within 100 m or so of WGS 84."""
-    if crs.is_geographic:
-        fits = (np.abs(xy) <= [180, 90]).all(axis=1)
-        return np.where(fits, xy[:, 0], np.nan), np.where(fits, xy[:, 1], np.nan)
-    lon, lat = Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True).transform(xy[:, 0], xy[:, 1])
-    return np.where(np.isfinite(lon), lon, np.nan), np.where(np.isfinite(lat), lat, np.nan)
-
-
 def _refuse_elsewhere(
-    crs: CRS, lon: Float[np.ndarray, " n"], lat: Float[np.ndarray, " n"], xyz: Float[np.ndarray, "n 3"], name: str
+    text: str, xyz: Float[np.ndarray, "points 3"], name: str, near: tuple[float, float] | None
 ) -> None:
-    if not (np.isfinite(lon) & np.isfinite(lat)).all():
-        row = int(np.argmin(np.isfinite(lon) & np.isfinite(lat)))
-        raise JaxbaError(
-            f"{name}: {describe(crs)} has no place with x {xyz[row, 0]:g}, y {xyz[row, 1]:g}; x is the easting or "
-            "longitude. Swap x and y if they are northing and easting, or correct the CRS."
-        )
-    if crs.is_projected:
-        cure = " Swap x and y if they are northing and easting (x is the easting), or correct the CRS of the list."
-        refuse_wrong_place(crs, lon, lat, f"{name}: {describe(crs)}", cure)
-
-
-def _vertical(crs: CRS) -> tuple[str, float, str | None]:
-    """Return the unit of z, its length in metres, and the surface that the CRS says z is above; None if it does not."""
-    if crs.is_compound:
-        vertical = crs.sub_crs_list[-1]
-        axis = vertical.axis_info[0]
-        return axis.unit_name, axis.unit_conversion_factor, authority_code(vertical) or "mean_sea_level"
-    if len(crs.axis_info) == 3:
-        axis = crs.axis_info[2]
-        return axis.unit_name, axis.unit_conversion_factor, "ellipsoidal"
-    if crs.is_projected:
-        return crs.axis_info[0].unit_name, crs.axis_info[0].unit_conversion_factor, None
-    return "metre", 1.0, None
+    crs = parse_crs(text, f"{name}: CRS")
+    if not (crs.is_projected or crs.is_geographic) or crs.geodetic_crs is None:
+        return  # refused with the transformation
+    lon, lat = rough_places(horizontal_part(crs), xyz[:, :2])
+    try:
+        if not (np.isfinite(lon) & np.isfinite(lat)).all():
+            row = int(np.argmin(np.isfinite(lon) & np.isfinite(lat)))
+            raise JaxbaError(
+                f"{name}: {describe(crs)} has no place with x {xyz[row, 0]:g}, y {xyz[row, 1]:g}; x is the easting or "
+                "longitude. Swap x and y if they are northing and easting, or correct the CRS."
+            )
+        if crs.is_projected:
+            cure = " Swap x and y if they are northing and easting (x is the easting), or correct the CRS of the list."
+            refuse_wrong_place(crs, lon, lat, f"{name}: {describe(crs)}", cure)
+    except JaxbaError as error:
+        fit = None
+        if near is not None:
+            fit = would_fit(text, xyz[:, :2], np.full(len(xyz), near[0]), np.full(len(xyz), near[1]), NEAR_M)
+        if fit is None:
+            raise
+        raise JaxbaError(f"{error} With {fit[0]} it would be {fit[1] / 1000:.2f} km from the photos.") from None
 
 
 def _datum(
@@ -205,12 +181,3 @@ def _datum(
 def _above(datum: str) -> str:
     own = vertical_crs(datum, "height datum")
     return KINDS[datum] if own is None else f"{own.name} ({datum})"
-
-
-def _code_of(text: str, lon: Float[np.ndarray, " n"], lat: Float[np.ndarray, " n"]) -> str:
-    """Return the code of a CRS: a PROJ string such as that of ODM's lists says the same as a UTM zone's."""
-    crs = parse_crs(text)
-    zone = utm_zone(float(np.median(lon)), float(np.median(lat)))
-    if authority_code(crs) is None and zone.equals(crs, ignore_axis_order=True):
-        return authority_code(zone) or text
-    return authority_code(crs) or text

@@ -16,8 +16,9 @@ from jaxtyping import Float
 from pyproj import CRS, Transformer
 from pyproj.enums import TransformDirection
 
+from jaxba._crs_text import authority_code
 from jaxba._errors import JaxbaError
-from jaxba.geo._crs import authority_code, middle
+from jaxba.geo._extent import middle
 from jaxba.geo._heights import HeightStep, height_step
 from jaxba.geo._operation import Operation, horizontal_operation
 from jaxba.scene import LocalFrame

@@ -10,11 +10,14 @@ the step is built from a three-dimensional source, without ballpark operations, 
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
 from pyproj import CRS
 from pyproj.database import get_units_map
 
+from jaxba._crs_text import authority_code
 from jaxba._errors import JaxbaError
-from jaxba.geo._crs import authority_code, describe, parse_crs
+from jaxba.geo._crs import describe, parse_crs
 from jaxba.geo._operation import Operation, grid_cure, operations
 
 KINDS = {
@@ -55,6 +58,43 @@ def vertical_crs(datum: str, label: str = "crs.height_datum") -> CRS | None:
         )
     _up_unit(crs, f"{label}={datum}")
     return crs
+
+
+def list_heights(
+    text: str, z: Float[np.ndarray, " rows"], name: str
+) -> tuple[Float[np.ndarray, " rows"], str | None, list[str]]:
+    """Return heights of a list in metres, the surface that their CRS says they are above, and notes on their unit.
+
+    Heights are in the unit of the CRS's vertical part; where it has none, in that of x and y, or in metres beside
+    degrees. The surface is None where the CRS does not say it.
+
+    - `text`: the CRS. `z`: as written, NaN where none was measured. `name`: of the list.
+
+    Raises `JaxbaError` for a vertical axis that does not point up or has an unknown unit.
+
+    >>> height_m, above, notes = list_heights("EPSG:26851", np.array([1050.0]), "geo.txt")
+    >>> height_m.round(2).tolist(), above
+    ([320.04], None)
+    >>> notes[0].split(": ")[1]
+    'EPSG:26851 (NAD83 / Minnesota South (ftUS)) does not say the unit of z, so z is in that of x and y'
+    """
+    crs = parse_crs(text, f"{name}: CRS")
+    vertical, kind = _vertical_part(crs)
+    above = None
+    if vertical is not None:
+        unit, unit_m = _up_unit(vertical, f"{name}: {describe(crs)}")
+        above = (authority_code(vertical) or "mean_sea_level") if kind == "gravity" else "ellipsoidal"
+        why = f"{describe(crs)} has heights in {unit}"
+    else:
+        axis = crs.axis_info[0]
+        unit, unit_m = (axis.unit_name, axis.unit_conversion_factor) if crs.is_projected else ("metre", 1.0)
+        why = f"{describe(crs)} does not say the unit of z, so z is in that of x and y"
+    height_m = unit_m * z
+    known = np.isfinite(z)
+    if unit_m == 1 or not known.any():
+        return height_m, above, []
+    median, median_m = float(np.median(z[known])), float(np.median(height_m[known]))
+    return height_m, above, [f"{name}: {why}: the median height, {median:.2f} {unit}, is {median_m:.2f} m."]
 
 
 def height_step(

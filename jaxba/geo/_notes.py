@@ -3,7 +3,8 @@
 import numpy as np
 from pyproj import CRS
 
-from jaxba.geo._crs import describe, grid_scale
+from jaxba.geo._crs import describe
+from jaxba.geo._extent import grid_scale
 from jaxba.geo._gates import Judgement
 from jaxba.geo._operation import horizontal_operation
 from jaxba.geo._positions import Measured, operation_notes

@@ -16,8 +16,9 @@ from pyproj.aoi import AreaOfInterest  # the same class as the one that Transfor
 from pyproj.enums import TransformDirection
 from pyproj.transformer import TransformerGroup
 
+from jaxba._crs_text import horizontal_part
 from jaxba._errors import JaxbaError
-from jaxba.geo._crs import describe, horizontal_part
+from jaxba.geo._crs import describe
 
 AROUND_DEG = 0.01
 

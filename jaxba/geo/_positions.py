@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from pyproj import Transformer
 
+from jaxba._crs_text import authority_code, horizontal_part
 from jaxba._errors import JaxbaError
-from jaxba.geo._crs import authority_code, describe, horizontal_part, parse_crs
+from jaxba.geo._crs import describe, parse_crs
 from jaxba.geo._heights import KINDS, vertical_crs
 from jaxba.geo._operation import Operation, horizontal_operation
 from jaxba.scene import Photo, Position

@@ -53,6 +53,7 @@ class Geotag:
     """An entry of a list.
 
     - `name`: of the photo, as the list writes it. `line`: where it stands.
+    - `position`: its `z_m` is as written, in the unit of the list's CRS.
     - `yaw_pitch_roll_deg`: as written, None where not known; `Geotags.is_nadir_zero` says what pitch 0 is.
     """
 

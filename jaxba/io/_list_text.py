@@ -32,9 +32,6 @@ PLACE_COLUMNS = {
 }  # fmt: skip
 """Titles of the columns that say where something is, as `plain_title` writes them."""
 
-_LONGEST = 200  # characters of a text that a message repeats
-_UTM = re.compile(r"WGS\s*_?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
-
 
 def content_lines(text: str) -> tuple[list[Line], str]:
     """Return the lines that are neither empty nor a comment, and the comment on the first line."""
@@ -101,39 +98,33 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def crs_of_comment(comment: str) -> str | None:
-    """Return the CRS that a comment such as `# EPSG:32615` names; None where it names none."""
+    """Return the CRS that a comment such as `# EPSG:32615` names; None where it does not look like one."""
     text = re.sub(r"^(crs|srs|epsg)\s*[:=]\s*", "", comment, flags=re.IGNORECASE)
-    if text.isdigit():
+    if re.fullmatch(r"\d+(\+\d+)?", text):
         return f"EPSG:{text}"
-    return text if re.match(r"(EPSG:|\+proj|WGS)", text, re.IGNORECASE) else None
+    is_crs = re.match(r"(EPSG|ESRI|OGC|IGNF):|\+\w+=|init=|WGS|(PROJ|GEO|COMP|BOUND)\w*\[", text, re.IGNORECASE)
+    return text if is_crs else None
 
 
 def read_crs(text: str, where: str, kind: str = "geo.txt") -> tuple[str, HeightKind]:
-    """Return a CRS as a text that pyproj reads, and what its heights are above.
+    """Return a CRS as its code, or as it is written where it has none, and what its heights are above.
 
     - `where`: file and line; `kind`: of list, for messages.
-    """
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
 
-    if match := _UTM.fullmatch(text):
-        zone, side = int(match[1]), match[2].upper()
-        if not 1 <= zone <= 60:
-            raise JaxbaError(f"{where}: UTM zone {zone} does not exist; give one from 1 to 60.")
-        return f"EPSG:{(32600 if side == 'N' else 32700) + zone}", "unknown"
-    text = f"EPSG:{text}" if text.isdigit() else text.upper() if text.lower().startswith("epsg:") else text
-    try:
-        crs = CRS.from_user_input(text)
-    except CRSError:
-        shown = text if len(text) <= _LONGEST else text[:_LONGEST] + "..."
-        raise JaxbaError(
-            f"{where}: '{shown}' is no CRS; give EPSG:4326, a PROJ string, or 'WGS84 UTM 17N' (a {kind} has it on its "
-            "first line, a CSV a header with the columns' names)."
-        ) from None
+    Raises `JaxbaError` for what is no CRS, and for what names no datum.
+    """
+    from jaxba._crs_text import authority_code, crs_of_text  # loads pyproj
+
+    no_crs = (
+        f"is no CRS; give EPSG:4326, a PROJ string, or 'WGS84 UTM 17N' (a {kind} has it on its first line, a CSV a "
+        "header with the columns' names)."
+    )
+    crs = crs_of_text(text, f"{where}: ", no_crs)
+    code = authority_code(crs) or text
     if crs.is_compound:
         vertical = crs.sub_crs_list[-1].name.lower()
-        return text, "ellipsoidal" if "ellipsoid" in vertical else "mean_sea_level"
-    return text, "ellipsoidal" if len(crs.axis_info) == 3 and crs.is_geographic else "unknown"
+        return code, "ellipsoidal" if "ellipsoid" in vertical else "mean_sea_level"
+    return code, "ellipsoidal" if len(crs.axis_info) == 3 and crs.is_geographic else "unknown"
 
 
 def refuse_degrees_out_of_range(crs: str, x: float, y: float, where: str) -> None:

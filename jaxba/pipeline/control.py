@@ -105,6 +105,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         name=names,
         height_datum=params.height_datum,
         photos_datum=None if frame is None else frame.height_datum,
+        near=None if frame is None else (frame.longitude_deg, frame.latitude_deg),
     )
     notes += surveyed.notes
     is_check = np.array([point.is_check for point in points])
@@ -284,13 +285,9 @@ def _refuse_far(
     away_km = float(np.hypot(*(np.median(xyz_m[:, :2], axis=0) - middle))) / 1000
     if away_km <= params.max_distance_km:
         return
-    tried = ""
-    for words, lon, lat in geo.elsewhere(points[0].crs, given[:, :2]):
-        place = geo.local_from_geodetic(frame, lon, lat, np.full(len(lon), frame.height_m))
-        would_km = float(np.hypot(*(np.median(place[:, :2], axis=0) - middle))) / 1000
-        if would_km <= params.max_distance_km:
-            tried = f" With {words} it would be {would_km:.2f} km: correct the list."
-            break
+    lon, lat = np.full(len(given), frame.longitude_deg), np.full(len(given), frame.latitude_deg)
+    fit = geo.would_fit(points[0].crs, given[:, :2], lon, lat, 1000 * params.max_distance_km)
+    tried = "" if fit is None else f" With {fit[0]} it would be {fit[1] / 1000:.2f} km: correct the list."
     raise JaxbaError(
         f"{names}: control lies {away_km:,.1f} km from the photos' positions, over {params.max_distance_km:g} km "
         f"(control.max_distance_km), by {points[0].crs}, the CRS of the list.{tried or ' A wrong zone or datum?'}"

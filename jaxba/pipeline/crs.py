@@ -40,6 +40,12 @@ class Params(Parameters):
     max_extent_km: float = parameter(
         100.0, low=1, high=1000, help="positions farther from the survey's middle go to review, kilometres"
     )
+    max_distance_km: float = parameter(
+        5.0,
+        low=0.1,
+        high=25_000,
+        help="stop where a list of positions lies farther from the photos' own tags, kilometres",
+    )
     min_positions: int = parameter(3, low=1, high=1_000_000, help="stop where fewer positions can be used")
     std_h: float = parameter(
         3.0, low=0.01, high=100, help="sigma east and north of a position without accuracy or fix, metres"
@@ -60,14 +66,16 @@ class Outputs:
 def run(inputs: Inputs, params: Params) -> Outputs:
     """Turn measured positions into the local frame and judge them.
 
-    Raises `JaxbaError` for a target CRS that does not fit the survey, for heights that cannot be had in it, and where
-    positions are given but fewer than `min_positions` of them can be used.
+    Raises `JaxbaError` for a list of positions that lies elsewhere than the photos' own tags, for a target CRS that
+    does not fit the survey, for heights that cannot be had in it, and where positions are given but fewer than
+    `min_positions` of them can be used.
     """
     from jaxba import geo  # loads pyproj
 
     photos = inputs.photos
     if all(photo.position is None for photo in photos):
         return Outputs(reference=_without_positions(photos, params), target_crs=params.target_crs)
+    told = geo.hold_against_tags(photos, 1000 * params.max_distance_km)
     measured = geo.measured_positions(
         photos, height_datum=params.height_datum, std_h_m=params.std_h, std_v_m=params.std_v
     )
@@ -112,6 +120,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         review=judged.review,
         notes=(
             *geo.frame_notes(frame, is_proposed=params.target_crs is None),
+            *told,
             *measured.notes,
             *geo.height_notes(measured, judged, frame),
             *judged.notes,

@@ -2,7 +2,8 @@
 
 Photos are the files with an image's suffix; RAW files are left out, and other files are counted. Of files with equal
 contents the first by name stays. A geo.txt or CSV replaces position, accuracy and, where it has angles, attitude of the
-photos that it lists; the height above take-off stays that of the tags. No pixel is decoded here.
+photos that it lists; its heights are turned into metres by the unit of its CRS. The height above take-off stays that of
+the tags, and what else they say of the place is kept beside, for the list to be held against. No pixel is decoded here.
 """
 
 import dataclasses
@@ -10,6 +11,8 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
+
+import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
@@ -82,8 +85,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     notes = [*_file_notes(inputs), *_camera_notes(photos, params.focal), *_photo_notes(photos)]
     if geotags is not None:
         entries, found = match_geotags(geotags, [photo.name for photo in photos], inputs.geotags_name)
+        entries, told = _with_heights_in_metres(entries, inputs.geotags_name)
         photos = [_tagged(photo, entries.get(photo.name), geotags.is_nadir_zero) for photo in photos]
-        notes += found
+        notes += [*found, *told]
     left_out.sort(key=lambda left: left.name)
     return Outputs(photos=tuple(photos), left_out=tuple(left_out), notes=tuple(notes))
 
@@ -153,6 +157,22 @@ def _photo_notes(photos: list[Photo]) -> list[str]:
     return notes
 
 
+def _with_heights_in_metres(entries: dict[str, Geotag], name: str) -> tuple[dict[str, Geotag], list[str]]:
+    """Return entries whose heights are metres, and notes on the unit that they were in."""
+    from jaxba import geo  # loads pyproj
+
+    changed, notes = dict(entries), []
+    for crs in sorted({entry.position.crs for entry in entries.values()}):
+        rows = [k for k, entry in entries.items() if entry.position.crs == crs and entry.position.z_m is not None]
+        z = np.array([entries[k].position.z_m for k in rows], float)
+        height_m, _, found = geo.list_heights(crs, z, name)
+        notes += found
+        for k, value in zip(rows, height_m, strict=True):
+            position = dataclasses.replace(entries[k].position, z_m=float(value))
+            changed[k] = dataclasses.replace(entries[k], position=position)
+    return changed, notes
+
+
 def _tagged(photo: Photo, entry: Geotag | None, is_nadir_zero: bool) -> Photo:
     if entry is None:
         return photo
@@ -163,4 +183,4 @@ def _tagged(photo: Photo, entry: Geotag | None, is_nadir_zero: bool) -> Photo:
     elif angles is not None:
         attitude = Attitude(yaw_deg=angles[0], pitch_deg=angles[1], roll_deg=angles[2])
     position = dataclasses.replace(entry.position, relative_altitude_m=relative_m)
-    return dataclasses.replace(photo, position=position, attitude=attitude)
+    return dataclasses.replace(photo, position=position, tag_position=photo.position, attitude=attitude)

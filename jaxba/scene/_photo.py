@@ -60,6 +60,7 @@ class Photo:
     - `orientation`: EXIF's, 1 to 8; recorded, not applied.
     - `camera`: photos with the same text share one camera's intrinsics.
     - `focal_px`: for this pixel grid. `focal_source`: how it was found; both None where nothing tells it.
+    - `tag_position`: what the tags say where a list replaces them as `position`; else None.
     - `attitude`: of the camera (the gimbal). `flight_attitude`: of the aircraft.
     - `notes`: what was odd and how it was handled.
     """
@@ -77,6 +78,7 @@ class Photo:
     focal_px: float | None = None
     focal_source: FocalSource | None = None
     position: Position | None = None
+    tag_position: Position | None = None
     attitude: Attitude | None = None
     flight_attitude: Attitude | None = None
     notes: tuple[str, ...] = ()

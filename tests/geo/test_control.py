@@ -64,7 +64,7 @@ def test_points_outside_their_crs_are_refused():
 
 def test_usual_mistakes_are_undone_one_by_one():
     xy = UTM[:, :2]
-    found = {words: (lon[0], lat[0]) for words, lon, lat in elsewhere("EPSG:32614", xy)}
+    found = {words: (lon[0], lat[0]) for words, lon, lat in elsewhere("EPSG:32614", xy, (-92.0, 46.8))}
     np.testing.assert_allclose(found["UTM zone 15N (EPSG:32615)"], [-92.0, 46.8], atol=1e-3)
-    swapped = elsewhere("EPSG:4326", np.array([[46.8, -89.0]]))
+    swapped = elsewhere("EPSG:4326", np.array([[46.8, -89.0]]), (-89.0, 46.8))
     assert swapped[0][0] == "x and y swapped" and (swapped[0][1][0], swapped[0][2][0]) == (-89.0, 46.8)

@@ -65,7 +65,7 @@ def test_a_crs_that_does_not_fit_is_refused_with_the_zone_that_does(text: str, w
     assert f"crs.target_crs={text}" in str(error.value)
 
 
-@pytest.mark.parametrize("text", ["", "EPSG:999999", "UTM", "32615 N", "WGS84 UTM 61N"])
+@pytest.mark.parametrize("text", ["", "EPSG:999999", "UTM", "32615 N"])
 def test_what_is_no_crs_is_refused(text: str):
     with pytest.raises(JaxbaError, match="is no CRS that PROJ knows; give an EPSG code"):
         target_crs(text, *MINNESOTA)

@@ -5,7 +5,7 @@ import pytest
 from pyproj import CRS, Transformer
 
 from jaxba._errors import JaxbaError
-from jaxba.geo import geodetic_from_local, height_step, local_frame, projected_from_local
+from jaxba.geo import geodetic_from_local, height_step, list_heights, local_frame, projected_from_local
 
 GERMANY = 14.0, 50.0
 MINNESOTA = -92.0, 46.8
@@ -96,3 +96,34 @@ def test_without_a_vertical_part_heights_stay_and_the_note_says_above_what():
 def test_a_height_datum_that_is_none_is_refused(datum, words):
     with pytest.raises(JaxbaError, match=words):
         step("EPSG:32615", datum)
+
+
+@pytest.mark.parametrize(
+    ("crs", "metres", "above", "words"),
+    [
+        ("EPSG:26851", 1200 / 3937, None, "does not say the unit of z, so z is in that of x and y"),  # US feet
+        ("EPSG:2222", 0.3048, None, "does not say the unit of z"),  # Arizona East, international feet
+        ("+proj=utm +zone=15 +datum=WGS84 +units=us-ft", 1200 / 3937, None, "does not say the unit of z"),
+        ("+proj=utm +zone=15 +ellps=GRS80 +towgs84=0,0,0 +units=ft", 0.3048, None, "does not say the unit of z"),
+        ("EPSG:26851+6360", 1200 / 3937, "EPSG:6360", "has heights in US survey foot"),
+        ("EPSG:26851+5703", 1.0, "EPSG:5703", ""),  # heights in metres beside x and y in feet
+        ("EPSG:32615+6360", 1200 / 3937, "EPSG:6360", "has heights in US survey foot"),
+        ("EPSG:32615+8228", 0.3048, "EPSG:8228", "has heights in foot"),
+        ("EPSG:4326+6360", 1200 / 3937, "EPSG:6360", "has heights in US survey foot"),
+        ("+proj=utm +zone=15 +datum=WGS84 +vunits=us-ft", 1200 / 3937, "ellipsoidal", "has heights in US survey foot"),
+        ("EPSG:32615", 1.0, None, ""),
+        ("EPSG:4326", 1.0, None, ""),
+        ("EPSG:4979", 1.0, "ellipsoidal", ""),
+        ("EPSG:32615+5773", 1.0, "EPSG:5773", ""),
+    ],
+)
+def test_heights_of_every_list_are_in_the_unit_of_their_axis_or_of_x_and_y(crs, metres, above, words):
+    height_m, found, notes = list_heights(crs, np.array([1000.0, np.nan, 1100.0]), "geo.txt")
+    np.testing.assert_allclose(height_m, [1000 * metres, np.nan, 1100 * metres], rtol=1e-12)
+    assert found == above and len(notes) == bool(words)
+    assert not words or (words in notes[0] and f"is {1050 * metres:.2f} m." in notes[0])
+
+
+def test_a_list_of_depths_is_refused():
+    with pytest.raises(JaxbaError, match=r"geo.txt: EPSG:32615\+5715 .*points down; give a CRS with heights"):
+        list_heights("EPSG:32615+5715", np.ones(1), "geo.txt")

@@ -74,7 +74,7 @@ def test_csv_of_longitude_and_latitude_is_wgs_84():
         ("", "is empty; give a CRS line"),
         ("EPSG:32615\n", "lists no mark"),
         ("EPSG:99999\n1 2 3 4 5 a.jpg", "line 1: 'EPSG:99999' is no CRS; give EPSG:4326"),
-        ("WGS84 UTM 61N\n1 2 3 4 5 a.jpg", "line 1: UTM zone 61 does not exist"),
+        ("WGS84 UTM 61N\n1 2 3 4 5 a.jpg", "line 1: 'WGS84 UTM 61N': UTM zone 61 does not exist"),
         ("1 2 3 4 5 a.jpg", "line 1: '1 2 3 4 5 a.jpg' is no CRS"),
         ("EPSG:32615\n1 2 3 4 a.jpg", r"line 2: '1 2 3 4 a.jpg' has 5 columns; give x y z px py image"),
         ("EPSG:32615\n1 2 3,5 4 5 a.jpg", "line 2: z '3,5' is no number; write it with a point"),

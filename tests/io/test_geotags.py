@@ -30,12 +30,16 @@ def test_documented_example_is_read():
         ("WGS84 UTM 17N", "EPSG:32617"),
         ("WGS84 UTM 5S", "EPSG:32705"),
         ("epsg:32617", "EPSG:32617"),
-        ("+proj=utm +zone=17 +ellps=WGS84 +datum=WGS84 +units=m +no_defs", None),
+        ("+proj=utm +zone=17 +ellps=WGS84 +datum=WGS84 +units=m +no_defs", "EPSG:32617"),
+        ("+proj=utm +zone=17 +south +datum=WGS84", "EPSG:32717"),
+        ("+init=epsg:32617", "EPSG:32617"),
+        (CRS("EPSG:32617").to_wkt("WKT1_ESRI"), "EPSG:32617"),
+        ("+proj=utm +zone=17 +datum=WGS84 +units=us-ft", "+proj=utm +zone=17 +datum=WGS84 +units=us-ft"),
     ],
 )
-def test_header_is_epsg_proj_or_utm(header: str, crs: str | None):
+def test_header_is_a_code_or_what_a_code_says(header: str, crs: str):
     position = parse_geotags(f"{header}\na.jpg 441024.157 4564001.875 345.17\n").entries[0].position
-    assert position.crs == (crs or header)
+    assert position.crs == crs
     assert CRS.from_user_input(position.crs).is_projected
     assert (position.x, position.y) == (441024.157, 4564001.875)
 

@@ -201,3 +201,20 @@ def test_list_that_fits_no_photo_or_two_is_refused(tmp_path: Path):
     with pytest.raises(JaxbaError, match=r"lines 2 and 3: both are one/a.jpg"):
         run(tmp_path, "EPSG:4326\none/a.jpg 1 2\none/A.jpg 1 2\ntwo/a.jpg 1 2\n")
     assert len(run(tmp_path, "EPSG:4326\none/a.jpg 1 2\ntwo/a.jpg 1 2\n").photos) == 2
+
+
+@pytest.mark.parametrize("header", ["EPSG:26851", "EPSG:26851+6360", "EPSG:4326+6360"])
+def test_heights_of_a_list_in_feet_are_turned_into_metres_and_it_is_said(tmp_path: Path, header: str):
+    write(tmp_path / "a.jpg")
+    xy = "-93.2 44.9" if header.startswith("EPSG:4326") else "2831907.6 1021700.2"
+    outputs = run(tmp_path, f"{header}\na.jpg {xy} 1050.87\n")
+    position = outputs.photos[0].position
+    assert position is not None and position.z_m == pytest.approx(1050.87 * 1200 / 3937)
+    assert any("1050.87 US survey foot, is 320.31 m" in note for note in outputs.notes)
+
+
+def test_tags_stay_beside_the_list_that_replaces_them(data_dir: Path):
+    folder = data_dir / "images" / "brighton"
+    plain, listed = run(folder), run(folder, "EPSG:32615\nDJI_0018.JPG 576690 5188170 250\n")
+    assert listed.photos[0].tag_position == plain.photos[0].position
+    assert all(photo.tag_position is None for photo in (*plain.photos, *listed.photos[1:]))

@@ -1,4 +1,4 @@
-"""Positions of a list beside those of the photos' tags, which are read again, and where both lie on earth."""
+"""Positions of a list beside those of the photos' tags, and where both lie on earth."""
 
 from dataclasses import dataclass
 
@@ -7,11 +7,8 @@ from jaxtyping import Float
 from pyproj import Geod, Transformer
 from pyproj.exceptions import ProjError
 
-from jaxba._errors import JaxbaError
 from jaxba.report._recorded import Recorded
-from jaxba.scene import Photo, PhotoFile, Position
-
-_COMPARED = 20  # photos whose tags are read again
+from jaxba.scene import Photo, Position
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,21 +34,12 @@ def wgs84(position: Position) -> tuple[float, float]:
 
 
 def against_tags(case: Recorded) -> Against | None:
-    """Return positions of a list beside those of the tags; None where there is no list, or the photos are gone."""
-    from jaxba.vision import read_photo
-
-    if case.done.metadata is None:
-        return None
-    pairs = []
-    for photo in case.done.photos[:_COMPARED]:
-        if photo.position is None or photo.position.source in ("EXIF", "XMP") or not photo.path.is_file():
-            continue
-        try:
-            tags = read_photo(PhotoFile(name=photo.name, path=photo.path, sha256=photo.sha256), max_focal_deviation=0.5)
-        except JaxbaError:  # its tags cannot be read any more: nothing to hold the list against
-            continue
-        if tags.position is not None and tags.position.source != photo.position.source:
-            pairs.append((photo, photo.position, tags.position))
+    """Return positions of a list beside those of the tags; None where there is no list, or the tags have none."""
+    pairs = [
+        (photo, photo.position, photo.tag_position)
+        for photo in (case.done.photos if case.done.metadata is not None else ())
+        if photo.position is not None and photo.tag_position is not None
+    ]
     if not pairs:
         return None
     photos, listed, tagged = zip(*pairs, strict=True)

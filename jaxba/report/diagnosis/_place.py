@@ -1,5 +1,5 @@
 """Rules on the place: positions in another zone or with swapped axes, datums that are mixed, a GNSS that contradicts
-itself. Where a list replaces the photos' tags, the tags are read again and held against it."""
+itself. Where a list replaces the photos' tags, they are held against it."""
 
 import numpy as np
 from jaxtyping import Bool, Float

@@ -15,7 +15,7 @@ from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._words import many, some_photos
 from jaxba.io import Geotag, match_geotags, parse_geotags
-from jaxba.report import Told, grouped
+from jaxba.report import Told, grouped, with_ranges
 from jaxba.scene import Attitude, LeftOut, Photo, PhotoFile
 from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
 
@@ -140,9 +140,8 @@ def _camera_notes(photos: list[Photo], focal_px: float | None) -> list[str]:
 def _photo_notes(photos: list[Photo]) -> list[str]:
     """Return what was odd about photos, each finding once with the photos that it concerns."""
     names: dict[str, list[str]] = {}
-    for photo in photos:
-        for note in photo.notes:
-            names.setdefault(note, []).append(photo.name)
+    for entry in with_ranges([LeftOut(name=photo.name, reason=note) for photo in photos for note in photo.notes]):
+        names.setdefault(entry.reason, []).append(entry.name)
     notes = [f"{some_photos(found)}: {note}" for note, found in sorted(names.items(), key=lambda item: -len(item[1]))]
     if len(notes) > _MOST_NOTES:
         more = len(notes) - _MOST_NOTES

@@ -48,6 +48,10 @@ class Tags:
         found = (number(self.xmp.get(name)) for name in names)
         return next((value for value in found if value is not None), None)
 
+    def drone_number(self, *names: str) -> float | None:
+        """Return the first of these XMP values that is a finite number, under whichever maker's prefix, or None."""
+        return self.xmp_number(*drone_names(*names))
+
     @property
     def original_size_px(self) -> tuple[float, float] | None:
         """Width and height that EXIF states, which a resize may have left stale."""
@@ -96,6 +100,11 @@ def read_tags(path: Path) -> Tags:
         xmp=xmp,
         problems=tuple(dict.fromkeys(problems)),
     )
+
+
+def drone_names(*names: str) -> tuple[str, ...]:
+    """Return names with the prefix of each maker of drones; Autel writes DJI's names under `drone`."""
+    return tuple(f"{drone}:{name}" for name in names for drone in ("drone-dji", "drone", "drone-parrot"))
 
 
 def number(value: Any) -> float | None:

@@ -12,7 +12,7 @@ from jaxba._errors import JaxbaError
 from jaxba.pipeline import metadata
 from jaxba.scene import Attitude, PhotoFile
 
-BASE = ExifTags.Base
+BASE, GPS = ExifTags.Base, ExifTags.GPS
 
 
 def files_of(folder: Path) -> tuple[PhotoFile, ...]:
@@ -201,3 +201,16 @@ def test_list_that_fits_no_photo_or_two_is_refused(tmp_path: Path):
     with pytest.raises(JaxbaError, match=r"lines 2 and 3: both are one/a.jpg"):
         run(tmp_path, "EPSG:4326\none/a.jpg 1 2\none/A.jpg 1 2\ntwo/a.jpg 1 2\n")
     assert len(run(tmp_path, "EPSG:4326\none/a.jpg 1 2\ntwo/a.jpg 1 2\n").photos) == 2
+
+
+def test_one_finding_that_differs_in_its_figures_alone_is_one_line(tmp_path: Path):
+    for name, mm in (("a.jpg", 300), ("b.jpg", 400), ("c.jpg", -500)):
+        exif = Image.Exif()
+        gps = {GPS.GPSLatitude: (47.0, 0.0, 0.0), GPS.GPSLongitude: (8.0, 0.0, 0.0)}
+        gps |= {GPS.GPSLatitudeRef: "N", GPS.GPSLongitudeRef: "E", GPS.GPSAltitude: 300.0, GPS.GPSAltitudeRef: b"\0"}
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
+        height = f"<d:AbsoluteAltitude>{mm / 1000 + 310:+}</d:AbsoluteAltitude>"
+        xmp = f'<a xmlns:d="http://www.dji.com/drone-dji/1.0/">{height}</a>'
+        Image.new("L", (40, 30)).save(tmp_path / name, exif=exif, xmp=xmp.encode())
+    (note,) = [note for note in run(tmp_path).notes if "AbsoluteAltitude" in note]
+    assert note.startswith("a.jpg, b.jpg, c.jpg: the height of EXIF lies 9.50 to 10.40 m below that of XMP's Absolute")

@@ -17,7 +17,7 @@ from jaxba.engine._words import many, some_photos
 from jaxba.io import Geotag, match_geotags, parse_geotags
 from jaxba.report import Told, grouped, with_ranges
 from jaxba.scene import Attitude, LeftOut, Photo, PhotoFile
-from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
+from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo, shared_cameras
 
 _SHOWN, _SHOWN_CAMERAS = 3, 5
 _MOST_NOTES = 20
@@ -79,7 +79,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     if not photos:
         reasons = " ".join(f"{left.name}: {left.reason}" for left in left_out[:_SHOWN])
         raise JaxbaError(f"none of the {len(images)} photos can be used. {reasons}")
-    notes = [*_file_notes(inputs), *_camera_notes(photos, params.focal), *_photo_notes(photos)]
+    photos, spellings = shared_cameras(photos)
+    notes = [*_file_notes(inputs), *spellings, *_camera_notes(photos, params.focal), *_photo_notes(photos)]
     if geotags is not None:
         entries, found = match_geotags(geotags, [photo.name for photo in photos], inputs.geotags_name)
         photos = [_tagged(photo, entries.get(photo.name), geotags.is_nadir_zero) for photo in photos]

@@ -1,4 +1,5 @@
 from ._attitude_tags import attitude_from_nadir_body as attitude_from_nadir_body
+from ._cameras import shared_cameras as shared_cameras
 from ._decode import Pixels as Pixels, decode as decode
 from ._features import (
     OrbOptions as OrbOptions,

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.geo._positions import Measured
-from jaxba.scene import LeftOut
+from jaxba.scene import LeftOut, described
 
 MIN_FRAMES_FOR_DRIFT = 12
 EXPLAINED_BY_TIME = 0.5
@@ -95,8 +95,9 @@ def judge_positions(
         f"lies {away / 1000:.0f} km from the middle of the survey, over {max_extent_m / 1000:g} km "
         "(crs.max_extent_km); check its coordinates" for away in np.nan_to_num(away_m)
     ])  # fmt: skip
-    drift = _height_drift(measured, left(), max_height_drift_m)
-    notes = _gate_altitudes(measured, left, gate, altitude_variance, std_v_m, drift is not None)
+    drift, odd = described("Drift of heights", lambda: _height_drift(measured, left(), max_height_drift_m), None)
+    notes = [f"{note}." for note in odd]
+    notes += _gate_altitudes(measured, left, gate, altitude_variance, std_v_m, drift is not None)
     is_used = left()
     known = is_used.sum() + counts.get("altitude", 0)
     if counts.get("altitude", 0) > 0.2 * known:

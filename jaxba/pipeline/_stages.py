@@ -144,7 +144,7 @@ def _reference_of(reference: Reference, images: list[int], *, with_heights: bool
 
 
 def _match_collected(done: Done, folders: dict[int, Path], digests: dict[int, str]) -> match.Outputs:
-    graphs, records = [], []
+    graphs, records, notes = [], [], []
     fallback: dict[int, FallbackKeypoints] = {}
     for image in sorted(folders):
         part = load(folders[image], match.Outputs)
@@ -154,9 +154,10 @@ def _match_collected(done: Done, folders: dict[int, Path], digests: dict[int, st
         for entry in part.fallback:  # the same of an image, whichever photo it was matched with
             fallback.setdefault(images[entry.image], dataclasses.replace(entry, image=images[entry.image]))
         records.append(part.record)
+        notes += part.notes
     found = tuple(fallback[image] for image in sorted(fallback))
     graph, record = ViewGraph.concatenate(graphs), PairRecord.concatenate(records)  # rising already: the same order
-    return match.Outputs(view_graph=graph, record=record, fallback=found)
+    return match.Outputs(view_graph=graph, record=record, fallback=found, notes=tuple(notes))
 
 
 def _tracks(done: Done) -> tracks.Inputs:

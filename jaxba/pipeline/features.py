@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._store import Stored
 from jaxba.pipeline._routing import Routing
 from jaxba.report import Told, grouped, with_ranges
-from jaxba.scene import Features, LeftOut, Photo
+from jaxba.scene import Features, LeftOut, Photo, described
 from jaxba.vision import (
     CONDITIONS,
     OrbOptions,
@@ -148,17 +148,21 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     conditions = tuple(condition.strip() for condition in params.condition.split(","))
     if inputs.is_height_varying and "auto" in conditions:
         conditions = (*conditions, "varying_height")
+    statistics, notes = None, ()
+    if "auto" in conditions:
+        statistics, notes = described("light and texture", lambda: measure_image(pixels.gray), None)
     tuning = tune(
         inputs.detector if params.detector == "auto" else params.detector,
         conditions,
-        measure_image(pixels.gray) if "auto" in conditions else None,
+        statistics,
         nfeatures=params.nfeatures,
         contrast_threshold=params.contrast_threshold,
         edge_threshold=params.edge_threshold,
         fast_threshold=params.fast_threshold,
         nlevels=params.nlevels,
     )
-    return Outputs(features=_detect(pixels, tuning, params), tuning=tuning)
+    found = _detect(pixels, tuning, params)
+    return Outputs(features=replace(found, notes=(*found.notes, *notes)), tuning=tuning)
 
 
 def check_store(store: Path, num_photos: int, detector: str, params: Params, resources: Resources) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxba._errors import JaxbaError
+from jaxba.scene import lacks_memory
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two for files over 4 GB
 
@@ -43,8 +44,10 @@ def decode(path: Path) -> Pixels:
         raise JaxbaError(f"{path} does not exist; restore the photo or take it off the list.") from None
     except Image.DecompressionBombError as error:
         raise JaxbaError(f"{path} is too large to decode ({error}); scale it down or cut it into parts.") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        if isinstance(error, JaxbaError):
+    except JaxbaError:
+        raise
+    except Exception as error:  # Pillow and OpenCV raise whatever the damaged bytes lead to
+        if lacks_memory(error) and not isinstance(error, OSError):
             raise
         raise JaxbaError(f"{path} cannot be decoded ({error}); copy it from the card again, or remove it.") from None
     if values.dtype != np.uint8:

@@ -80,7 +80,9 @@ def read_tags(path: Path) -> Tags:
         ) from None
     except Image.DecompressionBombError as error:
         raise JaxbaError(f"{path} is too large to decode ({error}); scale it down or cut it into parts.") from None
-    except (OSError, SyntaxError, ValueError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow raises whatever the damaged bytes lead to
         raise JaxbaError(f"{path}: its header cannot be read ({error}); copy it again or remove it.") from None
     for warning in caught:
         if not issubclass(warning.category, Image.DecompressionBombWarning | ResourceWarning):

@@ -31,6 +31,23 @@ def test_black_frame_has_zero_features(tmp_path: Path) -> None:
     assert found.num_keypoints == 0 and "no texture" in found.notes[0]
 
 
+def test_a_frame_whose_statistics_fail_keeps_its_features_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(gray: np.ndarray) -> None:
+        raise ValueError("zero-size array to reduction operation minimum which has no identity")
+
+    path = tmp_path / "noise.jpg"
+    Image.effect_noise((320, 240), 50).save(path)
+    inputs = features.Inputs(photo=photo_of(path, 320, 240))
+    plain = features.run(inputs, features.Params())
+    monkeypatch.setattr(features, "measure_image", fail)
+    found = features.run(inputs, features.Params())
+    assert np.array_equal(found.features.xy_px, plain.features.xy_px) and found.tuning.statistics is None
+    said = [note for note in found.features.notes if "light and texture could not be measured" in note]
+    assert len(said) == 1 and "zero-size array" in said[0] and "the work goes on without it" in said[0]
+
+
 def test_frame_of_another_size_than_its_tags_were_read_of_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "resized.jpg"
     Image.new("RGB", (320, 240)).save(path)

@@ -58,6 +58,7 @@ def _features(done: Done) -> list[Item]:
         )
         identity = {
             "photo": (photo.sha256, photo.width_px),
+            "mask": None if photo.mask is None else photo.mask.sha256,
             "detector": inputs.detector,
             "varying height": inputs.is_height_varying,
         }
@@ -122,7 +123,7 @@ def _match(done: Done) -> list[Item]:
         }
         megapixels = 1.0
         if np.isfinite(inputs.reference.height_above_ground_m[0]):
-            identity["photos"] = [entry.sha256 for entry in photos]
+            identity["photos"] = [(entry.sha256, entry.mask.sha256 if entry.mask else None) for entry in photos]
             megapixels = max(entry.megapixels for entry in photos)
         items.append(Item(photo.name, inputs, identity, megapixels, len(rows)))
     return items

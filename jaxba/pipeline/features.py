@@ -1,4 +1,7 @@
-"""Stage features: keypoints and descriptors of one photo; the runner calls it once a photo, in worker processes."""
+"""Stage features: keypoints and descriptors of one photo, none where its mask is black.
+
+The runner calls it once a photo, in worker processes.
+"""
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxba._errors import JaxbaError
 from jaxba.engine import Resources
@@ -25,6 +29,7 @@ from jaxba.vision import (
     detect_features,
     measure_image,
     most_keypoints,
+    read_mask,
     store_bytes,
     tune,
 )
@@ -161,7 +166,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         fast_threshold=params.fast_threshold,
         nlevels=params.nlevels,
     )
-    found = _detect(pixels, tuning, params)
+    mask = None if photo.mask is None else read_mask(photo.mask.path, photo.width_px, photo.height_px)
+    found = _detect(pixels, mask, tuning, params)
     return Outputs(features=replace(found, notes=(*found.notes, *notes)), tuning=tuning)
 
 
@@ -198,7 +204,7 @@ def facts(outputs: Detected, told: Told) -> dict[str, Any]:
     return {"features": {"routing": asdict(outputs.routing), "photos": photos}}
 
 
-def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:
+def _detect(pixels: Pixels, mask: UInt8[np.ndarray, "height width"] | None, tuning: Tuning, params: Params) -> Features:
     if tuning.detector == "sift":
         assert tuning.contrast_threshold is not None and tuning.edge_threshold is not None
         return detect_features(
@@ -208,9 +214,10 @@ def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:
             contrast_floor=_CONTRAST_FLOOR if params.contrast_threshold is None else params.contrast_threshold,
             edge_threshold=tuning.edge_threshold,
             sigma=params.sigma,
+            mask=mask,
         )
     if tuning.detector == "akaze":
-        return detect_features(pixels, detector="akaze", nfeatures=tuning.nfeatures)
+        return detect_features(pixels, detector="akaze", nfeatures=tuning.nfeatures, mask=mask)
     assert tuning.fast_threshold is not None and tuning.nlevels is not None
     options = OrbOptions(
         fast_threshold=tuning.fast_threshold,
@@ -221,4 +228,4 @@ def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:
         wta_k=params.wta_k,
         score=params.orb_score,
     )
-    return detect_features(pixels, detector="orb", nfeatures=tuning.nfeatures, orb=options)
+    return detect_features(pixels, detector="orb", nfeatures=tuning.nfeatures, orb=options, mask=mask)

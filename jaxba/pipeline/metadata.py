@@ -1,8 +1,8 @@
 """Stage metadata: what each photo's tags and header tell; what cannot be used is left out and named.
 
-Photos are the files with an image's suffix; RAW files are left out, and other files are counted. Of files with equal
-contents the first by name stays. A geo.txt or CSV replaces position, accuracy and, where it has angles, attitude of the
-photos that it lists; the height above take-off stays that of the tags. No pixel is decoded here.
+Photos are the files with an image's suffix that are no masks; RAW files are left out, other files are counted. Of files
+with equal contents the first by name stays. A geo.txt or CSV replaces position, accuracy and, where it has angles,
+attitude of the photos that it lists; the height above take-off stays that of the tags. No pixel is decoded here.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._words import many, some_photos
 from jaxba.io import Geotag, match_geotags, parse_geotags
+from jaxba.pipeline._masks import is_mask, with_masks
 from jaxba.report import Told, grouped, with_ranges
 from jaxba.scene import Attitude, LeftOut, Photo, PhotoFile
 from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo, shared_cameras
@@ -58,6 +59,11 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     geotags = None if inputs.geotags is None else parse_geotags(inputs.geotags, inputs.geotags_name)
     files = sorted(inputs.files, key=lambda file: file.name)
     images = [file for file in files if _suffix(file) in IMAGE_SUFFIXES]
+    masks = [file for file in images if is_mask(file.name)]
+    if len(masks) < len(images):  # else the photos themselves have such names
+        images = [file for file in images if file not in masks]
+    else:
+        masks = []
     if not images:
         raise JaxbaError(f"there is no photo: the folder holds {_counted(files)}; give one with JPEG or TIFF photos.")
     left_out = [LeftOut(name=f.name, reason=_RAW_CURE) for f in files if _suffix(f) in RAW_SUFFIXES]
@@ -80,7 +86,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         reasons = " ".join(f"{left.name}: {left.reason}" for left in left_out[:_SHOWN])
         raise JaxbaError(f"none of the {len(images)} photos can be used. {reasons}")
     photos, spellings = shared_cameras(photos)
-    notes = [*_file_notes(inputs), *spellings, *_camera_notes(photos, params.focal), *_photo_notes(photos)]
+    photos, masked = with_masks(photos, masks)
+    notes = [*_file_notes(inputs), *masked, *spellings, *_camera_notes(photos, params.focal), *_photo_notes(photos)]
     if geotags is not None:
         entries, found = match_geotags(geotags, [photo.name for photo in photos], inputs.geotags_name)
         photos = [_tagged(photo, entries.get(photo.name), geotags.is_nadir_zero) for photo in photos]

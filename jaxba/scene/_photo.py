@@ -77,6 +77,7 @@ class Photo:
     - `focal_px`: for this pixel grid. `focal_source`: how it was found; both None where nothing tells it.
     - `attitude`: of the camera (the gimbal). `flight_attitude`: of the aircraft.
     - `notes`: what was odd and how it was handled.
+    - `mask`: an image file, black where no features are to be taken.
     """
 
     name: str
@@ -97,6 +98,7 @@ class Photo:
     notes: tuple[str, ...] = ()
     original_size_px: tuple[int, int] | None = None
     lens: Lens = Lens()
+    mask: PhotoFile | None = None
 
     @property
     def megapixels(self) -> float:

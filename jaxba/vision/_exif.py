@@ -104,6 +104,12 @@ def read_tags(path: Path) -> Tags:
     )
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Return width and height of an image file in pixels; raises `JaxbaError` as `read_tags`."""
+    tags = read_tags(path)
+    return tags.width_px, tags.height_px
+
+
 def drone_names(*names: str) -> tuple[str, ...]:
     """Return names with the prefix of each maker of drones; Autel writes DJI's names under `drone`."""
     return tuple(f"{drone}:{name}" for name in names for drone in ("drone-dji", "drone", "drone-parrot"))

@@ -37,6 +37,7 @@ LEVEL_GAP = 0.25
 FLIGHT_GAP_S = 180.0
 """A longer pause is taken as a landing, after which relative altitudes may start from another place."""
 MIN_FLIGHT_HEIGHT_M = 2.0
+_ONE_SIZE = 0.2  # spread of heights without their signs, as a share: a flight across sea level has heights near 0, too
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +106,7 @@ def judge_positions(
             f"{counts['altitude']} of {known} positions are off the median flight height: a flight at several heights, "
             "or over steep ground? If so raise crs.altitude_variance, so that they are used."
         )
+    notes += _two_sided(measured, is_used)
     stated = measured.stated_std_h_m
     for k in np.flatnonzero(is_used & (stated > h_accuracy_threshold_m)):
         reasons[k] = (
@@ -122,6 +124,21 @@ def judge_positions(
         counts=counts,
         notes=tuple(notes),
     )
+
+
+def _two_sided(measured: Measured, rows: Bool[np.ndarray, " photos"]) -> list[str]:
+    """Return a note on heights of one size with both signs: a side of sea level was lost in some of the photos."""
+    rows = rows & np.isfinite(measured.height_m)
+    below, above = rows & (measured.height_m < 0), rows & (measured.height_m > 0)
+    size_m = np.abs(measured.height_m[rows])
+    if not below.any() or not above.any() or np.ptp(size_m) > _ONE_SIZE * np.median(size_m):
+        return []
+    first = [measured.names[int(np.flatnonzero(side)[0])] for side in (below, above)]
+    return [
+        f"Heights of {below.sum()} positions are about {np.median(size_m):.0f} m below zero (first: {first[0]}) and of "
+        f"{above.sum()} as much above (first: {first[1]}): one of the two signs is wrong (GPSAltitudeRef, or a minus "
+        "in the list). Mend it, or give the heights in a geo.txt."
+    ]
 
 
 def _missing_texts(measured: Measured) -> list[str]:

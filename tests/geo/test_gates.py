@@ -109,6 +109,21 @@ def test_a_frame_on_the_ground_goes_to_review_without_relative_altitudes():
     assert "has a height of 240.0 m, " in judged.review[0].reason
 
 
+@pytest.mark.parametrize("num_below", [1, 10, 19])
+def test_heights_of_one_size_and_both_signs_are_named(num_below: int):
+    heights = 320 + noise(20, 1.0)
+    heights[:num_below] *= -1
+    judged = judge(flight(heights, np.full(20, 70.0)))
+    (note,) = [note for note in judged.notes if "below zero" in note]
+    assert f"Heights of {num_below} positions are about 320 m below zero (first: p000.jpg)" in note
+    assert f"of {20 - num_below} as much above (first: p{num_below:03d}.jpg)" in note
+
+
+@pytest.mark.parametrize("heights", [np.linspace(-30, 30, 20), np.full(20, -410.0), np.linspace(2, 40, 20)])
+def test_heights_about_or_below_sea_level_are_not(heights: np.ndarray):
+    assert not any("below zero" in note for note in judge(flight(heights, np.full(20, 70.0))).notes)
+
+
 def test_relative_altitudes_of_zero_are_no_flight_height():
     judged = judge(flight(300 + noise(20, 2.0), np.zeros(20)))
     assert judged.is_used.all()

@@ -45,7 +45,7 @@ def test_every_parameter_is_explained_with_default_range_and_meaning(cli):
 
 PUBLISHED = {  # the defaults and ranges that users of such pipelines know
     "crs.target_crs": ("none", ""),
-    "crs.h_accuracy_threshold": ("2", "0.05 to 5"),
+    "crs.h_accuracy_threshold": ("2", "0.05 to 100"),
     "crs.altitude_variance": ("0.05", "0.01 to 0.5"),
     "features.detector": ("auto", "auto, sift, orb, akaze"),
     "features.nfeatures": ("none", "2000 to 20000"),

@@ -7,7 +7,6 @@ who was only in the way of another is no victim. Workers end with the run, also 
 """
 
 import contextlib
-import errno
 import multiprocessing
 import os
 import signal
@@ -28,13 +27,13 @@ from pebble import ProcessExpired, ProcessPool
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._workers import Resources
+from jaxba.scene import fault, lacks_memory
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 _AHEAD = 2  # items given out a worker, so that none waits for its next one
 _MOST_BROKEN = 3  # pools in a row that break before an item ended
 _LOOK_S = 0.5
 _STUCK_S = 180.0  # beyond the time limit: a worker was killed as it held the lock on the others
-_OPENCV_NO_MEMORY = -4
 _TOO_LARGE, _NO_MEMORY, _DIED = "needs about", "not enough memory", "its worker process"  # reasons begin with them
 _DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux
 
@@ -232,15 +231,9 @@ def _called(call: Callable[..., Any], arguments: tuple[Any, ...]) -> _Ended:
     except JaxbaError as error:
         return _Ended("error", None, str(error))
     except BaseException as error:  # whatever a decoder makes of a broken file, it costs that file alone
-        if _lacks_memory(error):
+        if lacks_memory(error):
             return _Ended("memory")
-        return _Ended("failed", None, f"{type(error).__name__}: {error}")
-
-
-def _lacks_memory(error: BaseException) -> bool:
-    if type(error).__module__ == "cv2":
-        return getattr(error, "code", 0) == _OPENCV_NO_MEMORY or "bad_alloc" in str(error)
-    return isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+        return _Ended("failed", None, f"was stopped {fault(error)}")
 
 
 def _prepare_worker(limit_bytes: int, call: Callable[..., Any]) -> None:

@@ -1,13 +1,16 @@
 """Which measured positions are trusted, and which go to review with the reason; no image is dropped here.
 
+Not used are:
+
 - Coordinates that are missing, out of range, or the (0, 0) of a receiver without a fix.
 - Far from the others: a wrong sign or a foreign photo.
-- A stated horizontal accuracy over the threshold.
 - A height off the median flight. Where photos have a relative altitude, that is the flight height, and the gate is a
   share of it. Where they have none, the height above ground is not known: then it is five robust sigmas (of the median
   absolute deviation), three sigmas of the receiver's height at least.
 - Heights that contradict each other: a receiver without a good fix can drift by tens of metres during a flight while it
   reports nothing. Then no single frame is wrong, and none is right: all keep their horizontal position, and no height.
+
+A stated horizontal accuracy over the threshold goes to review, too, and the position is used: its own sigma weighs it.
 
 The drift is told from a real change of height by what it depends on. With relative altitudes: the barometer does not
 see it. Without: a drone that follows the terrain or flies several heights has heights that depend on the place, a drift
@@ -21,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.geo._positions import Measured
-from jaxba.scene import LeftOut
+from jaxba.scene import LeftOut, described
 
 MIN_FRAMES_FOR_DRIFT = 12
 EXPLAINED_BY_TIME = 0.5
@@ -34,6 +37,7 @@ LEVEL_GAP = 0.25
 FLIGHT_GAP_S = 180.0
 """A longer pause is taken as a landing, after which relative altitudes may start from another place."""
 MIN_FLIGHT_HEIGHT_M = 2.0
+_ONE_SIZE = 0.2  # spread of heights without their signs, as a share: a flight across sea level has heights near 0, too
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +53,9 @@ class HeightDrift:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judgement:
-    """- `is_used`, `height_above_ground_m`, `review`, `notes`: see `Reference`. `counts`: of reasons, by kind.
+    """- `is_used`, `height_above_ground_m`, `review`, `notes`: see `Reference`.
+
+    - `counts`: of reasons why positions are not used, by kind.
 
     - `drift`: None where heights are trusted.
     """
@@ -71,7 +77,7 @@ def judge_positions(
     max_extent_m: float,
     std_v_m: float,
 ) -> Judgement:
-    """Return which positions are trusted, and the reason for each that is not."""
+    """Return which positions are trusted, and what should be looked at, with the reason."""
     count = len(measured.names)
     reasons: list[str] = [""] * count
     counts: dict[str, int] = {}
@@ -90,19 +96,22 @@ def judge_positions(
         f"lies {away / 1000:.0f} km from the middle of the survey, over {max_extent_m / 1000:g} km "
         "(crs.max_extent_km); check its coordinates" for away in np.nan_to_num(away_m)
     ])  # fmt: skip
-    stated = measured.stated_std_h_m
-    gate(stated > h_accuracy_threshold_m, "horizontal accuracy", [
-        f"states a horizontal accuracy of {std:.2f} m, over {h_accuracy_threshold_m:g} m (crs.h_accuracy_threshold)"
-        for std in stated
-    ])  # fmt: skip
-    drift = _height_drift(measured, left(), max_height_drift_m)
-    notes = _gate_altitudes(measured, left, gate, altitude_variance, std_v_m, drift is not None)
+    drift, odd = described("Drift of heights", lambda: _height_drift(measured, left(), max_height_drift_m), None)
+    notes = [f"{note}." for note in odd]
+    notes += _gate_altitudes(measured, left, gate, altitude_variance, std_v_m, drift is not None)
     is_used = left()
     known = is_used.sum() + counts.get("altitude", 0)
     if counts.get("altitude", 0) > 0.2 * known:
         notes.append(
             f"{counts['altitude']} of {known} positions are off the median flight height: a flight at several heights, "
             "or over steep ground? If so raise crs.altitude_variance, so that they are used."
+        )
+    notes += _two_sided(measured, is_used)
+    stated = measured.stated_std_h_m
+    for k in np.flatnonzero(is_used & (stated > h_accuracy_threshold_m)):
+        reasons[k] = (
+            f"states a horizontal accuracy of {stated[k]:.2f} m, over {h_accuracy_threshold_m:g} m "
+            "(crs.h_accuracy_threshold); the position is used with that sigma"
         )
     review = tuple(LeftOut(name=name, reason=text) for name, text in zip(measured.names, reasons, strict=True) if text)
     relative = measured.relative_altitude_m
@@ -115,6 +124,21 @@ def judge_positions(
         counts=counts,
         notes=tuple(notes),
     )
+
+
+def _two_sided(measured: Measured, rows: Bool[np.ndarray, " photos"]) -> list[str]:
+    """Return a note on heights of one size with both signs: a side of sea level was lost in some of the photos."""
+    rows = rows & np.isfinite(measured.height_m)
+    below, above = rows & (measured.height_m < 0), rows & (measured.height_m > 0)
+    size_m = np.abs(measured.height_m[rows])
+    if not below.any() or not above.any() or np.ptp(size_m) > _ONE_SIZE * np.median(size_m):
+        return []
+    first = [measured.names[int(np.flatnonzero(side)[0])] for side in (below, above)]
+    return [
+        f"Heights of {below.sum()} positions are about {np.median(size_m):.0f} m below zero (first: {first[0]}) and of "
+        f"{above.sum()} as much above (first: {first[1]}): one of the two signs is wrong (GPSAltitudeRef, or a minus "
+        "in the list). Mend it, or give the heights in a geo.txt."
+    ]
 
 
 def _missing_texts(measured: Measured) -> list[str]:

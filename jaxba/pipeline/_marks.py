@@ -1,11 +1,11 @@
-"""Marks of control points on the photos' own pixel grid; what cannot be used is named.
+"""Marks of control points on the photos' own pixel grid as it is stored; what cannot be used is named.
 
 Marks are often set in the original photos, and the photos shrunk afterwards. That shows by marks beyond the photos'
 edges. They are scaled by a factor that something states: `control.mark_width_px`, or the size that EXIF keeps from
 before; without one they are refused. Where no more than a tenth lies outside, these are mistakes and left out.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
 from jaxba.io import Mark, SurveyedPoint, photo_finder
+from jaxba.pipeline._mark_turn import TURNS, best_turn, on_stored_grid, shown_size
 from jaxba.scene import LeftOut, Photo
 
+Expected = Callable[[Int[np.ndarray, " marks"], Int[np.ndarray, " marks"]], Float[np.ndarray, "marks 2"]]
+"""Returns where points, by their row, are roughly seen in images; NaN where that is unknown."""
 _OUTSIDE = 0.1  # of all marks: more of them outside are no single mistakes
 _SAME_FORMAT = 0.02  # the format, width over height, of a photo that was only scaled
 _ONE_PIXEL = 2.0  # px: as near to each other are marks of one target
@@ -33,11 +36,19 @@ class PhotoMarks:
 
 
 def marks_in_photos(
-    points: Sequence[SurveyedPoint], photos: Sequence[Photo], mark_width_px: int | None, name: str
+    points: Sequence[SurveyedPoint],
+    photos: Sequence[Photo],
+    mark_width_px: int | None,
+    name: str,
+    *,
+    orientation: str = "auto",
+    expected: Expected | None = None,
 ) -> PhotoMarks:
     """Return the marks of points in photos.
 
     - `mark_width_px`: of the photos that marks were set in. `name`: of the list, for messages.
+    - `orientation`: under which they were shown then: `stored`, `exif`, or one for all, `2` to `8`; `auto` takes them
+      for set on the stored grid, and refuses marks that another orientation fits. `expected`: where points are seen.
 
     Raises `JaxbaError` where no photo of the list is there, a point is marked twice in a photo, and where marks lie
     outside their photos and nothing tells the scale.
@@ -74,7 +85,18 @@ def marks_in_photos(
     ]
     xy_px = np.array([[mark.x_px, mark.y_px] for mark in marks])
     size_px = np.array([[photos[k].width_px, photos[k].height_px] for k in image], float)
-    xy_px, notes = _scaled(xy_px, size_px, [photos[k] for k in image], mark_width_px, name)
+    marked = [photos[k] for k in image]
+    own = np.array([photo.orientation for photo in marked])
+    notes = []
+    if orientation == "auto":
+        seen_px = None if expected is None else expected(np.array(point), np.array(image))
+        notes = _refuse_turned(xy_px, size_px, marked, mark_width_px, name, seen_px)
+    turn = own if orientation == "exif" else np.full(len(own), int(orientation) if orientation.isdigit() else 1)
+    if orientation not in ("auto", "stored"):
+        how = "each photo's EXIF orientation" if orientation == "exif" else f"orientation {orientation}"
+        notes.append(f"{name}: marks are turned back by {how} (control.mark_orientation={orientation}).")
+    xy_px, scaled = _on_grid(xy_px, size_px, marked, mark_width_px, name, turn)
+    notes += scaled
     outside = _outside(xy_px, size_px)
     for k in np.flatnonzero(outside):
         photo = photos[image[k]]
@@ -91,6 +113,60 @@ def marks_in_photos(
         point=np.array(point, np.int64)[keep], image=np.array(image, np.int64)[keep], xy_px=xy_px[keep],
         left_out=tuple(left), notes=tuple(notes),
     )  # fmt: skip
+
+
+def _on_grid(
+    xy_px: Float[np.ndarray, "marks 2"],
+    size_px: Float[np.ndarray, "marks 2"],
+    photos: Sequence[Photo],
+    mark_width_px: int | None,
+    name: str,
+    turn: Int[np.ndarray, " marks"],
+) -> tuple[Float[np.ndarray, "marks 2"], list[str]]:
+    """Return marks that were set in photos shown under orientations, scaled, on the stored grid, and notes."""
+    scaled, notes = _scaled(xy_px, shown_size(size_px, turn), photos, mark_width_px, name, turn)
+    return on_stored_grid(scaled, size_px, turn), notes
+
+
+def _refuse_turned(
+    xy_px: Float[np.ndarray, "marks 2"],
+    size_px: Float[np.ndarray, "marks 2"],
+    photos: Sequence[Photo],
+    mark_width_px: int | None,
+    name: str,
+    expected_px: Float[np.ndarray, "marks 2"] | None,
+) -> list[str]:
+    """Refuse marks that fit on turned photos alone; return notes on photos that viewers turn."""
+
+    def placed(turn: Int[np.ndarray, " marks"]) -> Float[np.ndarray, "marks 2"] | None:
+        try:
+            return _on_grid(xy_px, size_px, photos, mark_width_px, name, turn)[0]
+        except JaxbaError:  # they lie outside
+            return None
+
+    own = np.array([photo.orientation for photo in photos])
+    best, away_px = best_turn(placed, own, expected_px, float(size_px.max()))
+    turned = sorted({photo.name for photo in photos if photo.orientation > 1})
+    are = f"{len(turned)} marked photos have an EXIF orientation other than 1"
+    if turned:
+        first = next(photo for photo in photos if photo.orientation > 1)
+        are += f" ({first.name}: {first.orientation}, {TURNS[first.orientation]} by viewers)"
+    if best == "stored":
+        return [f"{name}: {are}; marks count on the stored pixel grid."] if turned else []
+    how = "as their EXIF orientation says" if best == "exif" else f"as by EXIF orientation {best}, {TURNS[int(best)]}"
+    off = f", {away_px[best]:.0f} px from where positions and attitudes see the points (median)" if away_px else ""
+    text = (
+        f"{name}: marks count on the photos' stored pixel grid, on which these do not fit. They fit if they were set "
+        f"in photos that were turned {how}{off}"
+        + (f"; unturned, {away_px['stored']:.0f} px" if "stored" in away_px else "; unturned, they lie outside")
+    )
+    cure = (
+        f"Set control.mark_orientation={best} to turn them back, or control.mark_orientation=stored to take them as "
+        "they are."
+    )
+    if not turned and "stored" in away_px:  # a yaw that is off by half a turn looks the same
+        return [f"{text}. They are taken as they are; the attitudes may be wrong instead. {cure}"]
+    raise JaxbaError(f"{text}.{f' {are}.' if turned else ''} {cure}")
 
 
 def _same_pixel(
@@ -124,16 +200,22 @@ def _scaled(
     photos: Sequence[Photo],
     mark_width_px: int | None,
     name: str,
+    turn: Int[np.ndarray, " marks"],
 ) -> tuple[Float[np.ndarray, "marks 2"], list[str]]:
-    """Return marks on the photos' own pixel grid, and how they got there; `photos`: of each mark."""
+    """Return marks on the photos' own pixels, and how they got there.
+
+    - `photos`: of each mark. `turn`: the EXIF orientation under which they were shown, `size_px` their size then.
+    """
     first = photos[0]
+    width, height = size_px[0].astype(int)
     if mark_width_px is not None:
         factor = size_px[:, :1] / mark_width_px
         note = f"{name}: marks are scaled by {factor[0, 0]:.5f}, from photos {mark_width_px} px wide as given to those "
-        return xy_px * factor, [f"{note}of {first.width_px} px (control.mark_width_px)."]
+        return xy_px * factor, [f"{note}of {width} px (control.mark_width_px)."]
     outside = _outside(xy_px, size_px)
     count, total = int(outside.sum()), len(xy_px)
     original = np.array([photo.original_size_px or (np.nan, np.nan) for photo in photos], float)
+    original = shown_size(original, turn)
     other = np.isfinite(original).all(axis=1) & (np.abs(original / size_px - 1) > 1e-6).any(axis=1)
     if count <= _OUTSIDE * total:
         if not other.any():
@@ -144,8 +226,8 @@ def _scaled(
         ]
     reach = f"up to {xy_px[:, 0].max():.0f} {xy_px[:, 1].max():.0f}"
     says = (
-        f"{name}: {count} of {total} marks lie outside their photos ({reach}; {first.name} has {first.width_px} x "
-        f"{first.height_px} pixels)"
+        f"{name}: {count} of {total} marks lie outside their photos ({reach}; {first.name} has {width} x {height} "
+        "pixels)"
     )
     shape = original[:, 0] / original[:, 1] * size_px[:, 1] / size_px[:, 0]
     scaled = xy_px * size_px / original
@@ -158,7 +240,7 @@ def _scaled(
         return scaled, [
             f"{says}, so they were set in the original photos: they are scaled by "
             f"{size_px[0, 0] / original[0, 0]:.5f}, from EXIF's {original[0, 0]:.0f} x {original[0, 1]:.0f} to "
-            f"{first.width_px} x {first.height_px} pixels."
+            f"{width} x {height} pixels."
         ]
     raise JaxbaError(
         f"{says}, and {why}, so their scale is not known. Give the width of the photos that they were set in, such as "

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.scene import Photo, Reference
+from jaxba.scene import Photo, Reference, described
 
 _HEIGHT_RATIO = 1.2  # one level of ORB's pyramid
 _OBLIQUE_RAD, _OBLIQUE_SHARE = np.deg2rad(20.0), 0.1
@@ -85,7 +85,8 @@ def route(
     else:
         chosen = "orb"
         reason = f"{gsd_text}, not over {100 * sift_gsd_m:g}; {overlap_text}, not under {sift_overlap:.0%}."
-    ratio, oblique = _height_ratio(height_m), _oblique_share(reference)
+    ratio, odd = described("the range of heights above ground", lambda: _height_ratio(height_m), np.nan)
+    oblique, more = described("the tilt of the photos", lambda: _oblique_share(reference), np.nan)
     varying = _varying_height(ratio, oblique)
     return Routing(
         detector=chosen,
@@ -97,7 +98,11 @@ def route(
         num_photos=len(photos),
         height_ratio=ratio,
         oblique_share=oblique,
-        reasons=(f"Detector {chosen.upper()}: {reason}", *varying),
+        reasons=(
+            f"Detector {chosen.upper()}: {reason}",
+            *varying,
+            *(f"{note[0].upper()}{note[1:]}." for note in (*odd, *more)),
+        ),
     )
 
 

@@ -7,6 +7,7 @@ is added costs its own work and that of its pairs.
 """
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,7 +30,7 @@ from jaxba.pipeline._done import Done
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._stages import NAMES, STAGES
 from jaxba.report import summary, told_of
-from jaxba.scene import LeftOut
+from jaxba.scene import LeftOut, described
 
 
 def run_pipeline(
@@ -98,8 +99,9 @@ def _run_stages(project: Project, given: Given, done: Done, until: str | None, t
             stages_run.append(stage.name)
         seconds = time.perf_counter() - begun
         left_here = left_out(STAGES, done)[stage.name]
-        first, *more = stage.module.lines(outputs, told_of(done, left_here))
-        lines[stage.name] = [first, *notes, *more]
+        say = functools.partial(stage.module.lines, outputs, told_of(done, left_here))
+        said, odd = described("the sentences on this stage", say, ["done"])
+        lines[stage.name] = [said[0], *notes, *said[1:], *odd]
         tell(Event("end", stage.name, total, total, seconds, left_here, lines=tuple(lines[stage.name])))
         if stage.name == until:
             break

@@ -58,6 +58,7 @@ def _features(done: Done) -> list[Item]:
         )
         identity = {
             "photo": (photo.sha256, photo.width_px),
+            "mask": None if photo.mask is None else photo.mask.sha256,
             "detector": inputs.detector,
             "varying height": inputs.is_height_varying,
         }
@@ -122,7 +123,7 @@ def _match(done: Done) -> list[Item]:
         }
         megapixels = 1.0
         if np.isfinite(inputs.reference.height_above_ground_m[0]):
-            identity["photos"] = [entry.sha256 for entry in photos]
+            identity["photos"] = [(entry.sha256, entry.mask.sha256 if entry.mask else None) for entry in photos]
             megapixels = max(entry.megapixels for entry in photos)
         items.append(Item(photo.name, inputs, identity, megapixels, len(rows)))
     return items
@@ -144,7 +145,7 @@ def _reference_of(reference: Reference, images: list[int], *, with_heights: bool
 
 
 def _match_collected(done: Done, folders: dict[int, Path], digests: dict[int, str]) -> match.Outputs:
-    graphs, records = [], []
+    graphs, records, notes = [], [], []
     fallback: dict[int, FallbackKeypoints] = {}
     for image in sorted(folders):
         part = load(folders[image], match.Outputs)
@@ -154,9 +155,10 @@ def _match_collected(done: Done, folders: dict[int, Path], digests: dict[int, st
         for entry in part.fallback:  # the same of an image, whichever photo it was matched with
             fallback.setdefault(images[entry.image], dataclasses.replace(entry, image=images[entry.image]))
         records.append(part.record)
+        notes += part.notes
     found = tuple(fallback[image] for image in sorted(fallback))
     graph, record = ViewGraph.concatenate(graphs), PairRecord.concatenate(records)  # rising already: the same order
-    return match.Outputs(view_graph=graph, record=record, fallback=found)
+    return match.Outputs(view_graph=graph, record=record, fallback=found, notes=tuple(notes))
 
 
 def _tracks(done: Done) -> tracks.Inputs:

@@ -11,7 +11,19 @@ from jaxtyping import Bool, Float
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._words import many
 from jaxba.report import Told, control_facts, grouped, sentences
-from jaxba.scene import Block, Control, ControlFit, Features, Finding, LeftOut, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import (
+    Block,
+    Control,
+    ControlFit,
+    Features,
+    Finding,
+    LeftOut,
+    Photo,
+    Reference,
+    Tracks,
+    ViewGraph,
+    described,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +150,12 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         photos,
         is_controlled=controlled.is_fixed,
     )
-    found = (*sfm.control_findings(adjusted, inputs.control, controlled.fit, reference, photos), *found)
+    on_control, notes = described(
+        "Findings on control",
+        lambda: sfm.control_findings(adjusted, inputs.control, controlled.fit, reference, photos),
+        (),
+    )
+    found = (*on_control, *found, *(Finding.of("note", text=f"{note}.") for note in notes))
     total = np.bincount(block.observation_point, adjusted.error_px, minlength=block.num_points)
     return Outputs(
         block=block,

@@ -9,6 +9,7 @@ another is given. Without a list the reference passes through.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.io import ControlList, SurveyedPoint, parse_control
+from jaxba.pipeline._mark_turn import expected_px
 from jaxba.pipeline._marks import marks_in_photos
 from jaxba.report import Told, control_facts, control_lines, reference_facts
 from jaxba.scene import Control, LeftOut, LocalFrame, Photo, Reference
@@ -55,6 +57,12 @@ class Params(Parameters):
     mark_std_px: float = parameter(1.0, low=0.05, high=20, help="sigma of a mark an axis, px")
     mark_width_px: int | None = parameter(
         None, low=16, high=200_000, help="width of the photos in which marks were set; none: as the files, or EXIF"
+    )
+    mark_orientation: str = parameter(
+        "auto",
+        choices=("auto", "stored", *map(str, range(2, 9)), "exif"),
+        help="how photos were turned when marks were set: stored: not; exif: by their EXIF orientation; 2 to 8: by "
+        "this one; auto: stored, and another that fits is named",
     )
     heights: str = parameter(
         "auto", choices=("auto", "use", "ignore"), help="heights of points; auto: not where all of them are 0"
@@ -94,8 +102,15 @@ def run(inputs: Inputs, params: Params) -> Outputs:
 
     names = " and ".join(entry[0] for entry in (inputs.gcp, inputs.check) if entry is not None)
     points, notes = _all_points(inputs, params)
-    found = marks_in_photos(points, inputs.photos, params.mark_width_px, names)
-    notes += found.notes
+    before_marks = len(notes)
+    mark = functools.partial(
+        marks_in_photos,
+        points,
+        inputs.photos,
+        params.mark_width_px,
+        names,
+        orientation=params.mark_orientation,
+    )
     xyz = np.array([[point.x, point.y, np.nan if point.z_m is None else point.z_m] for point in points])
     xyz[:, 2] = _heights(xyz[:, 2], params.heights, names, notes)
     frame = inputs.reference.frame
@@ -116,6 +131,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     elif params.method != "none" and np.isfinite(xyz[~is_check, 2]).any():
         reference = dataclasses.replace(reference, frame=_with_trusted_heights(frame, geo.UNTRUSTED))
     if frame is None:
+        found = mark()
+        notes[before_marks:before_marks] = found.notes
         nothing = dataclasses.replace(Control.nothing(), method=params.method)
         return Outputs(reference=reference, control=nothing, left_out=found.left_out, notes=tuple(notes))
     height_m, told = geo.heights_above(frame.height_datum, surveyed, names)
@@ -129,6 +146,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         frame, surveyed.longitude_deg, surveyed.latitude_deg, np.where(known, height_m, frame.height_m)
     )
     _refuse_far(xyz_m, xyz, points, inputs.reference, frame, params, names)
+    found = mark(expected=functools.partial(expected_px, inputs.photos, inputs.reference, xyz_m))
+    notes[before_marks:before_marks] = found.notes
     control = Control(
         names=tuple(point.name for point in points),
         xyz_m=xyz_m,

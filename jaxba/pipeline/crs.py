@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
-from jaxba.report import Told, grouped, reference_facts
+from jaxba.report import Told, grouped, reference_facts, with_ranges
 from jaxba.scene import LeftOut, Photo, Reference
 
 
@@ -29,7 +29,7 @@ class Params(Parameters):
         "EPSG:5773",
     )
     h_accuracy_threshold: float = parameter(
-        2.0, low=0.05, high=5, help="a stated horizontal accuracy over this, metres, goes to review"
+        2.0, low=0.05, high=100, help="a stated horizontal accuracy over this, metres, is named for review"
     )
     altitude_variance: float = parameter(
         0.05, low=0.01, high=0.5, help="off the median by more than this share of the flight height goes to review"
@@ -135,7 +135,7 @@ def lines(outputs: Outputs, told: Told) -> list[str]:
     reference = outputs.reference
     where = reference.frame.crs_name if reference.frame is not None else "no place on earth"
     first = f"{where}; {int(reference.is_used.sum())} of {len(reference.is_used)} positions used"
-    return [first, *reference.notes, *grouped(reference.review)]
+    return [first, *reference.notes, *grouped(with_ranges(reference.review))]
 
 
 def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def _stop_if_too_few(is_used: np.ndarray, counts: dict[str, int], review: tuple[
     raise JaxbaError(
         f"only {is_used.sum()} of {len(is_used)} photos have a position that can be used, and crs.min_positions="
         f"{params.min_positions}. To review: {why}{first}. Mend the positions with a geo.txt, or loosen "
-        "crs.h_accuracy_threshold, crs.altitude_variance or crs.min_positions."
+        "crs.altitude_variance or crs.min_positions."
     )
 
 

@@ -17,7 +17,7 @@ from jaxba.engine._store import sha256
 from jaxba.engine._words import many
 from jaxba.pipeline import adjust
 from jaxba.report import Told
-from jaxba.scene import Block, Control, LocalFrame, Photo, Reference
+from jaxba.scene import Block, Control, LocalFrame, Photo, Reference, described
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,10 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     gnss = inputs.reference.xyz_m[block.image_index], inputs.reference.std_m[block.image_index]
     io.write_opensfm(folder / "reconstruction.json", block, photos, frame, *gnss)
     notes = [*_notes(inputs, frame), *_name_notes(photos), *_write_tile(inputs)]
-    _write(folder / "cloud.png", _picture(inputs, cloud, frame))
+    picture, odd = described("The picture cloud.png", lambda: _picture(inputs, cloud, frame), None)
+    notes += odd
+    if picture is not None:
+        _write(folder / "cloud.png", picture)
     _write(folder / "README.txt", _readme(notes).encode())
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return Outputs(files=tuple(files), sha256=tuple(sha256(folder / name) for name in files), notes=tuple(notes))

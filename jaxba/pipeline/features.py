@@ -1,12 +1,16 @@
-"""Stage features: keypoints and descriptors of one photo; the runner calls it once a photo, in worker processes."""
+"""Stage features: keypoints and descriptors of one photo, none where its mask is black.
+
+The runner calls it once a photo, in worker processes.
+"""
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from jaxba._errors import JaxbaError
 from jaxba.engine import Resources
@@ -15,7 +19,7 @@ from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._store import Stored
 from jaxba.pipeline._routing import Routing
 from jaxba.report import Told, grouped, with_ranges
-from jaxba.scene import Features, LeftOut, Photo
+from jaxba.scene import Features, LeftOut, Photo, described
 from jaxba.vision import (
     CONDITIONS,
     OrbOptions,
@@ -25,6 +29,7 @@ from jaxba.vision import (
     detect_features,
     measure_image,
     most_keypoints,
+    read_mask,
     store_bytes,
     tune,
 )
@@ -148,17 +153,22 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     conditions = tuple(condition.strip() for condition in params.condition.split(","))
     if inputs.is_height_varying and "auto" in conditions:
         conditions = (*conditions, "varying_height")
+    statistics, notes = None, ()
+    if "auto" in conditions:
+        statistics, notes = described("light and texture", lambda: measure_image(pixels.gray), None)
     tuning = tune(
         inputs.detector if params.detector == "auto" else params.detector,
         conditions,
-        measure_image(pixels.gray) if "auto" in conditions else None,
+        statistics,
         nfeatures=params.nfeatures,
         contrast_threshold=params.contrast_threshold,
         edge_threshold=params.edge_threshold,
         fast_threshold=params.fast_threshold,
         nlevels=params.nlevels,
     )
-    return Outputs(features=_detect(pixels, tuning, params), tuning=tuning)
+    mask = None if photo.mask is None else read_mask(photo.mask.path, photo.width_px, photo.height_px)
+    found = _detect(pixels, mask, tuning, params)
+    return Outputs(features=replace(found, notes=(*found.notes, *notes)), tuning=tuning)
 
 
 def check_store(store: Path, num_photos: int, detector: str, params: Params, resources: Resources) -> None:
@@ -194,7 +204,7 @@ def facts(outputs: Detected, told: Told) -> dict[str, Any]:
     return {"features": {"routing": asdict(outputs.routing), "photos": photos}}
 
 
-def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:
+def _detect(pixels: Pixels, mask: UInt8[np.ndarray, "height width"] | None, tuning: Tuning, params: Params) -> Features:
     if tuning.detector == "sift":
         assert tuning.contrast_threshold is not None and tuning.edge_threshold is not None
         return detect_features(
@@ -204,9 +214,10 @@ def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:
             contrast_floor=_CONTRAST_FLOOR if params.contrast_threshold is None else params.contrast_threshold,
             edge_threshold=tuning.edge_threshold,
             sigma=params.sigma,
+            mask=mask,
         )
     if tuning.detector == "akaze":
-        return detect_features(pixels, detector="akaze", nfeatures=tuning.nfeatures)
+        return detect_features(pixels, detector="akaze", nfeatures=tuning.nfeatures, mask=mask)
     assert tuning.fast_threshold is not None and tuning.nlevels is not None
     options = OrbOptions(
         fast_threshold=tuning.fast_threshold,
@@ -217,4 +228,4 @@ def _detect(pixels: Pixels, tuning: Tuning, params: Params) -> Features:
         wta_k=params.wta_k,
         score=params.orb_score,
     )
-    return detect_features(pixels, detector="orb", nfeatures=tuning.nfeatures, orb=options)
+    return detect_features(pixels, detector="orb", nfeatures=tuning.nfeatures, orb=options, mask=mask)

@@ -10,8 +10,20 @@ from jaxtyping import Float, Int
 
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.pipeline._fallback import FallbackKeypoints, detect_fallback
-from jaxba.report import Told, grouped, pair_facts, pair_lines
-from jaxba.scene import EdgeStatus, Fallback, Features, Missed, Model, PairRecord, Photo, Reference, ViewGraph
+from jaxba.report import Told, grouped, pair_facts, pair_lines, with_ranges
+from jaxba.scene import (
+    EdgeStatus,
+    Fallback,
+    Features,
+    LeftOut,
+    Missed,
+    Model,
+    PairRecord,
+    Photo,
+    Reference,
+    ViewGraph,
+    described,
+)
 from jaxba.vision import (
     Descriptors,
     Pinhole,
@@ -76,11 +88,13 @@ class Outputs:
     - `fallback`: SIFT keypoints of photos with a pair that failed with ORB and was matched with SIFT. Its matches count
       them on from the photo's ORB features.
     - `record`: what was decided on each pair, in the view graph's order.
+    - `notes`: what could not be measured of pairs.
     """
 
     view_graph: ViewGraph
     record: PairRecord
     fallback: tuple[FallbackKeypoints, ...] = ()
+    notes: tuple[LeftOut, ...] = ()
 
     @property
     def num_fallback(self) -> int:
@@ -102,16 +116,17 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     prepared = prepare_descriptors(features)
     own: tuple[Features, Descriptors] | None = None  # SIFT, once a pair asks for it
     edges, records, fallback = [], [], {}
+    notes: list[LeftOut] = []
     for partner, overlap in zip(inputs.partners.tolist(), inputs.overlap.tolist(), strict=True):
         others = inputs.features[partner]
-        edge, record = _matched(inputs, partner, overlap, features, prepared, others, params)
+        edge, record = _matched(inputs, partner, overlap, features, prepared, others, params, notes)
         outcome, gsd_m = _may_fall_back(inputs, partner, edge, features, others, params)
         if outcome == Fallback.TAKEN:
             if own is None:
                 found = _sift(inputs, inputs.image, params)
                 own = found, prepare_descriptors(found)
             sift = _sift(inputs, partner, params)
-            again, its_record = _matched(inputs, partner, overlap, *own, sift, params)
+            again, its_record = _matched(inputs, partner, overlap, *own, sift, params, notes)
             if (again.status[0], again.num_inliers[0]) > (edge.status[0], edge.num_inliers[0]):
                 behind = np.array([features.num_keypoints, others.num_keypoints], np.int32)
                 edge, record = dataclasses.replace(again, matches=again.matches + behind), its_record
@@ -125,6 +140,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         view_graph=ViewGraph.concatenate(edges),
         record=PairRecord.concatenate(records),
         fallback=tuple(fallback.values()),
+        notes=tuple(notes),
     )
 
 
@@ -134,7 +150,8 @@ def lines(outputs: Outputs, told: Told) -> list[str]:
     good, weak = (int((graph.status == status).sum()) for status in (EdgeStatus.GOOD, EdgeStatus.WEAK))
     rejected = len(graph.pairs) - good - weak
     first = f"{good:,} good pairs, {weak:,} weak, {rejected:,} rejected; {len(graph.matches):,} matches"
-    return [first, *pair_lines(graph, outputs.record), *grouped(told.left_out)]
+    odd = grouped(with_ranges(outputs.notes))
+    return [first, *pair_lines(graph, outputs.record), *grouped(told.left_out), *odd]
 
 
 def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
@@ -159,12 +176,14 @@ def _matched(
     prepared: Descriptors,
     others: Features,
     params: Params,
+    notes: list[LeftOut],
 ) -> tuple[ViewGraph, PairRecord]:
     """Return the view graph of one pair, matched by features of one kind, and how it was verified."""
     first, second = inputs.photos[inputs.image], inputs.photos[partner]
-    matches, distinctiveness = _matches(
+    matches, distinctiveness, odd = _matches(
         features, prepared, others, first, second, params.ratio, may_be_apart=not np.isfinite(overlap)
     )
+    notes += [LeftOut(name=f"{first.name}, {second.name}", reason=note) for note in odd]
     threshold_px = float(params.ransac_threshold or _threshold_px(first, second, overlap))
     two_view = verify(
         features.xy_px[matches[:, 0]],
@@ -227,24 +246,30 @@ def _matches(
     ratio: float,
     *,
     may_be_apart: bool,
-) -> tuple[Int[np.ndarray, "matches 2"], Float[np.ndarray, " matches"]]:
-    """Return the matches of two photos and how distinct they are; none where the photos show different ground.
+) -> tuple[Int[np.ndarray, "matches 2"], Float[np.ndarray, " matches"], tuple[str, ...]]:
+    """Return the matches of two photos, how distinct they are, and notes; none where they show different ground.
 
     `may_be_apart`: nothing says that they overlap, so that the largest features alone may rule it out.
     """
     prepared_others = prepare_descriptors(others)
-    ground = common_ground(
-        prepared,
-        prepared_others,
-        features.xy_px,
-        others.xy_px,
-        (first.width_px, first.height_px),
-        (second.width_px, second.height_px),
-        ratio,
+    ground, notes = described(
+        "common ground",
+        lambda: common_ground(
+            prepared,
+            prepared_others,
+            features.xy_px,
+            others.xy_px,
+            (first.width_px, first.height_px),
+            (second.width_px, second.height_px),
+            ratio,
+        ),
+        None,
     )
+    if ground is None:  # it only spares comparisons
+        return *match_descriptors(prepared, prepared_others, ratio), notes
     if ground.is_apart and may_be_apart:
-        return np.zeros((0, 2), np.int64), np.zeros(0)
-    return match_descriptors(prepared.take(ground.first), prepared_others.take(ground.second), ratio)
+        return np.zeros((0, 2), np.int64), np.zeros(0), notes
+    return *match_descriptors(prepared.take(ground.first), prepared_others.take(ground.second), ratio), notes
 
 
 def _edge(

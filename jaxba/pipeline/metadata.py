@@ -1,9 +1,10 @@
 """Stage metadata: what each photo's tags and header tell; what cannot be used is left out and named.
 
-Photos are the files with an image's suffix; RAW files are left out, and other files are counted. Of files with equal
-contents the first by name stays. A geo.txt or CSV replaces position, accuracy and, where it has angles, attitude of the
-photos that it lists; its heights are turned into metres by the unit of its CRS. The height above take-off stays that of
-the tags, and what else they say of the place is kept beside, for the list to be held against. No pixel is decoded here.
+Photos are the files with an image's suffix that are no masks; RAW files are left out, and other files are counted. Of
+files with equal contents the first by name stays. A geo.txt or CSV replaces position, accuracy and, where it has angles,
+attitude of the photos that it lists; its heights are turned into metres by the unit of its CRS. The height above take-off
+stays that of the tags, and what else they say of the place is kept beside, for the list to be held against. No pixel is
+decoded here.
 """
 
 import dataclasses
@@ -18,9 +19,10 @@ from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._words import many, some_photos
 from jaxba.io import Geotag, match_geotags, parse_geotags
-from jaxba.report import Told, grouped
+from jaxba.pipeline._masks import is_mask, with_masks
+from jaxba.report import Told, grouped, with_ranges
 from jaxba.scene import Attitude, LeftOut, Photo, PhotoFile
-from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo
+from jaxba.vision import IMAGE_SUFFIXES, RAW_SUFFIXES, attitude_from_nadir_body, read_photo, shared_cameras
 
 _SHOWN, _SHOWN_CAMERAS = 3, 5
 _MOST_NOTES = 20
@@ -61,6 +63,11 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     geotags = None if inputs.geotags is None else parse_geotags(inputs.geotags, inputs.geotags_name)
     files = sorted(inputs.files, key=lambda file: file.name)
     images = [file for file in files if _suffix(file) in IMAGE_SUFFIXES]
+    masks = [file for file in images if is_mask(file.name)]
+    if len(masks) < len(images):  # else the photos themselves have such names
+        images = [file for file in images if file not in masks]
+    else:
+        masks = []
     if not images:
         raise JaxbaError(f"there is no photo: the folder holds {_counted(files)}; give one with JPEG or TIFF photos.")
     left_out = [LeftOut(name=f.name, reason=_RAW_CURE) for f in files if _suffix(f) in RAW_SUFFIXES]
@@ -82,7 +89,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     if not photos:
         reasons = " ".join(f"{left.name}: {left.reason}" for left in left_out[:_SHOWN])
         raise JaxbaError(f"none of the {len(images)} photos can be used. {reasons}")
-    notes = [*_file_notes(inputs), *_camera_notes(photos, params.focal), *_photo_notes(photos)]
+    photos, spellings = shared_cameras(photos)
+    photos, masked = with_masks(photos, masks)
+    notes = [*_file_notes(inputs), *masked, *spellings, *_camera_notes(photos, params.focal), *_photo_notes(photos)]
     if geotags is not None:
         entries, found = match_geotags(geotags, [photo.name for photo in photos], inputs.geotags_name)
         entries, told = _with_heights_in_metres(entries, inputs.geotags_name)
@@ -144,9 +153,8 @@ def _camera_notes(photos: list[Photo], focal_px: float | None) -> list[str]:
 def _photo_notes(photos: list[Photo]) -> list[str]:
     """Return what was odd about photos, each finding once with the photos that it concerns."""
     names: dict[str, list[str]] = {}
-    for photo in photos:
-        for note in photo.notes:
-            names.setdefault(note, []).append(photo.name)
+    for entry in with_ranges([LeftOut(name=photo.name, reason=note) for photo in photos for note in photo.notes]):
+        names.setdefault(entry.reason, []).append(entry.name)
     notes = [f"{some_photos(found)}: {note}" for note, found in sorted(names.items(), key=lambda item: -len(item[1]))]
     if len(notes) > _MOST_NOTES:
         more = len(notes) - _MOST_NOTES

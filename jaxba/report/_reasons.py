@@ -7,7 +7,7 @@ from jaxba.engine._words import some_photos
 from jaxba.scene import LeftOut
 
 _MOST_LINES = 10
-_NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?!\w)")
 
 
 def grouped(entries: Sequence[LeftOut]) -> list[str]:

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from jaxba.engine._stage import Stage, left_out
 from jaxba.report._told import Told
-from jaxba.scene import Control, LeftOut
+from jaxba.scene import Control, LeftOut, described
 
 
 def told_of(done: Any, left_out: tuple[LeftOut, ...] = ()) -> Told:
@@ -38,7 +39,10 @@ def summary(
     for stage in stages:
         outputs = getattr(done, stage.name)
         if outputs is not None:
-            facts |= stage.module.facts(outputs, told)
+            found, notes = described("the figures of this stage", partial(stage.module.facts, outputs, told), {})
+            facts |= found
+            if notes:
+                facts["stages"].setdefault(stage.name, []).extend(notes)
     facts["left_out"] = [
         {"stage": stage, "name": entry.name, "reason": entry.reason}
         for stage, entries in left_out(stages, done).items()

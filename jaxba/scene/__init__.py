@@ -7,12 +7,13 @@ from jaxba.scene._attitude import Attitude, cam_from_enu
 from jaxba.scene._block import Block
 from jaxba.scene._candidates import joining_pairs, nearest_pairs, pairs_between, window_pairs
 from jaxba.scene._control import Control, ControlFit
+from jaxba.scene._described import described, fault, lacks_memory
 from jaxba.scene._features import Features
 from jaxba.scene._finding import Finding
 from jaxba.scene._footprint import Footprints, footprint_overlaps, footprint_pairs, ground_footprints
 from jaxba.scene._graph import components
 from jaxba.scene._pair_record import Fallback, Missed, Model, PairRecord
-from jaxba.scene._photo import Fix, FocalSource, HeightKind, LeftOut, Photo, PhotoFile, Position
+from jaxba.scene._photo import Fix, FocalSource, HeightKind, LeftOut, Lens, Photo, PhotoFile, Position
 from jaxba.scene._reference import LocalFrame, Reference
 from jaxba.scene._track_building import build_tracks
 from jaxba.scene._tracks import Tracks
@@ -20,8 +21,8 @@ from jaxba.scene._view_graph import EdgeStatus, ViewGraph
 
 __all__ = [
     "Attitude", "Block", "Control", "ControlFit", "EdgeStatus", "Fallback", "Features", "Finding", "Fix",
-    "FocalSource", "Footprints", "HeightKind", "LeftOut", "LocalFrame", "Missed", "Model", "PairRecord", "Photo",
-    "PhotoFile", "Position", "Reference", "Tracks", "ViewGraph", "build_tracks", "cam_from_enu", "components",
-    "footprint_overlaps", "footprint_pairs", "ground_footprints", "joining_pairs", "nearest_pairs", "pairs_between",
-    "window_pairs",
+    "FocalSource", "Footprints", "HeightKind", "LeftOut", "Lens", "LocalFrame", "Missed", "Model", "PairRecord",
+    "Photo", "PhotoFile", "Position", "Reference", "Tracks", "ViewGraph", "build_tracks", "cam_from_enu",
+    "components", "described", "fault", "footprint_overlaps", "footprint_pairs", "ground_footprints", "joining_pairs",
+    "lacks_memory", "nearest_pairs", "pairs_between", "window_pairs",
 ]  # fmt: skip

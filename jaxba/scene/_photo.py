@@ -52,17 +52,33 @@ class Position:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Lens:
+    """What tells the camera of a photo from others, as its tags say it.
+
+    - `body`: make, model, serial number, lens, band and place in a rig, in words.
+    - `focal_mm`: of the lens. `digital_zoom`: by which the photo was cut and enlarged, 1 without.
+    - `equivalent_mm`: focal length on 35 mm film that gives the same view, of the photo as it is stored.
+    """
+
+    body: str = "unknown camera"
+    focal_mm: float | None = None
+    digital_zoom: float = 1.0
+    equivalent_mm: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Photo:
     """A usable frame.
 
     - `width_px`, `height_px`: of the stored pixel grid, read from the image itself and not from its tags.
     - `original_size_px`: width and height that EXIF states, from before a resize; None where it states none.
     - `orientation`: EXIF's, 1 to 8; recorded, not applied.
-    - `camera`: photos with the same text share one camera's intrinsics.
+    - `camera`: photos with the same text share one camera's intrinsics. `lens`: what of the tags tells cameras apart.
     - `focal_px`: for this pixel grid. `focal_source`: how it was found; both None where nothing tells it.
     - `tag_position`: what the tags say where a list replaces them as `position`; else None.
     - `attitude`: of the camera (the gimbal). `flight_attitude`: of the aircraft.
     - `notes`: what was odd and how it was handled.
+    - `mask`: an image file, black where no features are to be taken.
     """
 
     name: str
@@ -83,6 +99,8 @@ class Photo:
     flight_attitude: Attitude | None = None
     notes: tuple[str, ...] = ()
     original_size_px: tuple[int, int] | None = None
+    lens: Lens = Lens()
+    mask: PhotoFile | None = None
 
     @property
     def megapixels(self) -> float:

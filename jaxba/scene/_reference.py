@@ -42,7 +42,7 @@ class Reference:
     - `quaternion`: attitude, `cam_from_world`, scalar first. `attitude_std_rad`: its sigma about each axis.
     - `is_used`: the position is trusted enough to be a prior.
     - `height_above_ground_m`: from the flight's relative altitude; NaN where it is unknown.
-    - `review`: images whose position is not used, with the reason.
+    - `review`: images whose position is not used, or used with a large sigma of its own, with the reason.
     - `notes`: what was found and decided, in sentences.
     """
 

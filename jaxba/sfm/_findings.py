@@ -1,7 +1,7 @@
 """Findings: what a surveyor should know of an adjusted block, each a kind and its figures; `jaxba.report` has words."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import gammaincinv
 
 from jaxba.geometry import CAMERAS
-from jaxba.scene import Block, Finding, Photo, Reference
+from jaxba.scene import Block, Finding, Photo, Reference, described
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._intrinsics import intrinsics_at_bounds, natural_intrinsics
 from jaxba.sfm._problem import used_positions
@@ -86,21 +86,24 @@ def findings(
     - `start`: the block before the adjustment. `is_controlled`: control points fix it in all axes.
     """
     block = adjusted.block
-    return tuple(
-        [
-            *_convergence(adjusted),
-            *_edges(adjusted),
-            *_images(adjusted, photos),
-            *_outliers(block, fit, photos),
-            *_scatter(adjusted, reference, fit),
-            *_height_drift(block, reference),
-            *_no_heights(block, reference),
-            *_focal_and_height(block, sigmas, reference, is_controlled),
-            *_intrinsics(block, start, photos),
-            *_positions(block, sigmas, reference, photos, is_controlled),
-            *([Finding.of("note", text=sigmas.why_not)] if sigmas.why_not else []),
-        ]
+    parts: tuple[tuple[str, Callable[[], Sequence[Finding]]], ...] = (
+        ("Convergence", lambda: _convergence(adjusted)),
+        ("Edges left out", lambda: _edges(adjusted)),
+        ("Images", lambda: _images(adjusted, photos)),
+        ("Contradicting positions", lambda: _outliers(block, fit, photos)),
+        ("Scatter of positions", lambda: _scatter(adjusted, reference, fit)),
+        ("Drift of heights", lambda: _height_drift(block, reference)),
+        ("Use of heights", lambda: _no_heights(block, reference)),
+        ("Focal length against height", lambda: _focal_and_height(block, sigmas, reference, is_controlled)),
+        ("Intrinsics", lambda: _intrinsics(block, start, photos)),
+        ("Sigmas of positions", lambda: _positions(block, sigmas, reference, photos, is_controlled)),
+        ("Sigmas", lambda: [Finding.of("note", text=sigmas.why_not)] if sigmas.why_not else []),
     )
+    found: list[Finding] = []
+    for what, find in parts:
+        made, notes = described(what, find, [])
+        found += [*made, *(Finding.of("note", text=f"{note}.") for note in notes)]
+    return tuple(found)
 
 
 def height_above_ground(block: Block) -> Float[np.ndarray, " images"]:

@@ -1,5 +1,7 @@
 from ._attitude_tags import attitude_from_nadir_body as attitude_from_nadir_body
-from ._decode import Pixels as Pixels, decode as decode
+from ._cameras import shared_cameras as shared_cameras
+from ._decode import Pixels as Pixels, decode as decode, read_mask as read_mask
+from ._exif import image_size as image_size
 from ._features import (
     OrbOptions as OrbOptions,
     detect_features as detect_features,

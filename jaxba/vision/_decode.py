@@ -13,8 +13,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxba._errors import JaxbaError
+from jaxba.scene import lacks_memory
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two for files over 4 GB
+
+_JPEG, _BLACK_IN_JPEG = b"\xff\xd8", 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,25 +36,50 @@ def decode(path: Path) -> Pixels:
     format.
     """
     import cv2
-    from PIL import Image
 
-    try:
-        with path.open("rb") as file:
-            is_tiff = file.read(4) in _TIFF
-        values = _read_tiff(path) if is_tiff else _read_with_pillow(path)
-    except FileNotFoundError:
-        raise JaxbaError(f"{path} does not exist; restore the photo or take it off the list.") from None
-    except Image.DecompressionBombError as error:
-        raise JaxbaError(f"{path} is too large to decode ({error}); scale it down or cut it into parts.") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        if isinstance(error, JaxbaError):
-            raise
-        raise JaxbaError(f"{path} cannot be decoded ({error}); copy it from the card again, or remove it.") from None
+    values = _read(path)
     if values.dtype != np.uint8:
         values = _stretch(values)
     rgb = values if values.ndim == 3 else np.repeat(values[:, :, None], 3, axis=2)
     gray = cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if values.ndim == 3 else values
     return Pixels(gray=np.ascontiguousarray(gray), rgb=np.ascontiguousarray(rgb))
+
+
+def read_mask(path: Path, width_px: int, height_px: int) -> UInt8[np.ndarray, "height width"]:
+    """Return a mask on the grid of its photo: 255 where features may be taken, 0 where it is black.
+
+    JPEG blurs edges, so that there values under 16 of 255 are black. Raises `JaxbaError` as `decode` does.
+    """
+    import cv2
+
+    values = _read(path)
+    values = values if values.ndim == 2 else values.max(axis=2)
+    with path.open("rb") as file:
+        is_jpeg = file.read(2) == _JPEG
+    mask = np.where(values >= _BLACK_IN_JPEG if is_jpeg else values > 0, np.uint8(255), np.uint8(0))
+    if mask.shape != (height_px, width_px):
+        mask = cv2.resize(mask, (width_px, height_px), interpolation=cv2.INTER_NEAREST)
+    return np.ascontiguousarray(mask)
+
+
+def _read(path: Path) -> np.ndarray:
+    """Return the values of an image file as they are, (height, width) or (height, width, 3); raises as `decode`."""
+    from PIL import Image
+
+    try:
+        with path.open("rb") as file:
+            is_tiff = file.read(4) in _TIFF
+        return _read_tiff(path) if is_tiff else _read_with_pillow(path)
+    except FileNotFoundError:
+        raise JaxbaError(f"{path} does not exist; restore the photo or take it off the list.") from None
+    except Image.DecompressionBombError as error:
+        raise JaxbaError(f"{path} is too large to decode ({error}); scale it down or cut it into parts.") from None
+    except JaxbaError:
+        raise
+    except Exception as error:  # Pillow and OpenCV raise whatever the damaged bytes lead to
+        if lacks_memory(error) and not isinstance(error, OSError):
+            raise
+        raise JaxbaError(f"{path} cannot be decoded ({error}); copy it from the card again, or remove it.") from None
 
 
 def _read_with_pillow(path: Path) -> np.ndarray:

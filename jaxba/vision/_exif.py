@@ -48,6 +48,10 @@ class Tags:
         found = (number(self.xmp.get(name)) for name in names)
         return next((value for value in found if value is not None), None)
 
+    def drone_number(self, *names: str) -> float | None:
+        """Return the first of these XMP values that is a finite number, under whichever maker's prefix, or None."""
+        return self.xmp_number(*drone_names(*names))
+
     @property
     def original_size_px(self) -> tuple[float, float] | None:
         """Width and height that EXIF states, which a resize may have left stale."""
@@ -76,7 +80,9 @@ def read_tags(path: Path) -> Tags:
         ) from None
     except Image.DecompressionBombError as error:
         raise JaxbaError(f"{path} is too large to decode ({error}); scale it down or cut it into parts.") from None
-    except (OSError, SyntaxError, ValueError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow raises whatever the damaged bytes lead to
         raise JaxbaError(f"{path}: its header cannot be read ({error}); copy it again or remove it.") from None
     for warning in caught:
         if not issubclass(warning.category, Image.DecompressionBombWarning | ResourceWarning):
@@ -96,6 +102,17 @@ def read_tags(path: Path) -> Tags:
         xmp=xmp,
         problems=tuple(dict.fromkeys(problems)),
     )
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return width and height of an image file in pixels; raises `JaxbaError` as `read_tags`."""
+    tags = read_tags(path)
+    return tags.width_px, tags.height_px
+
+
+def drone_names(*names: str) -> tuple[str, ...]:
+    """Return names with the prefix of each maker of drones; Autel writes DJI's names under `drone`."""
+    return tuple(f"{drone}:{name}" for name in names for drone in ("drone-dji", "drone", "drone-parrot"))
 
 
 def number(value: Any) -> float | None:

@@ -60,10 +60,12 @@ def detect_features(
     edge_threshold: float = 10.0,
     sigma: float = 1.6,
     orb: OrbOptions = OrbOptions(),
+    mask: UInt8[np.ndarray, "height width"] | None = None,
 ) -> Features:
     """Return the features of the best `nfeatures` keypoints of an image; a frame without texture has none.
 
-    `contrast_threshold`, `contrast_floor`, `edge_threshold` and `sigma` (px, blur of the first octave) are SIFT's.
+    `contrast_threshold`, `contrast_floor`, `edge_threshold` and `sigma` (px, blur of the first octave) are SIFT's. No
+    keypoint lies where `mask` is 0.
 
     SIFT keeps the largest keypoints, ORB the strongest; a SIFT keypoint with several orientations counts once.
 
@@ -78,12 +80,14 @@ def detect_features(
     notes = []
     if detector == "sift":
         floor = min(contrast_floor, contrast_threshold)
-        keypoints, descriptors, note = _sift(pixels.gray, nfeatures, contrast_threshold, floor, edge_threshold, sigma)
+        keypoints, descriptors, note = _sift(
+            pixels.gray, mask, nfeatures, contrast_threshold, floor, edge_threshold, sigma
+        )
         notes += [note] * bool(note)
     elif detector == "orb":
-        keypoints, descriptors = _orb(pixels.gray, nfeatures, orb)
+        keypoints, descriptors = _orb(pixels.gray, mask, nfeatures, orb)
     else:
-        keypoints, descriptors = _akaze(pixels.gray)
+        keypoints, descriptors = _akaze(pixels.gray, mask)
     rows = np.array([(*k.pt, k.size, k.angle, k.response, k.octave) for k in keypoints], np.float64).reshape(-1, 6)
     x, y, size, angle, response, octave = rows.T
     height, width = pixels.gray.shape
@@ -95,6 +99,8 @@ def detect_features(
     # SIFT's come in their order; the descriptors of the others do not depend on it
     order = np.arange(len(x)) if detector == "sift" else np.lexsort([angle, size, x, y, -response])[:nfeatures]
     xy_px = xy_px[order]
+    if mask is not None:
+        notes.append(f"{np.mean(mask == 0):.0%} of the photo is masked")
     if len(order) == 0:
         notes.append(f"no texture: zero keypoints at a mean brightness of {brightness:.0f} of 255")
     column = np.clip(xy_px[:, 0], 0, width - 1).astype(int)
@@ -123,7 +129,13 @@ def grid_coverage(xy_px: Float[np.ndarray, "points 2"], width_px: int, height_px
 
 
 def _sift(
-    gray: UInt8[np.ndarray, "height width"], nfeatures: int, contrast: float, floor: float, edge: float, sigma: float
+    gray: UInt8[np.ndarray, "height width"],
+    mask: UInt8[np.ndarray, "height width"] | None,
+    nfeatures: int,
+    contrast: float,
+    floor: float,
+    edge: float,
+    sigma: float,
 ) -> tuple[Any, UInt8[np.ndarray, "keypoints 128"], str]:
     """Return keypoints, descriptors and what was odd about their strength."""
     import cv2
@@ -136,7 +148,7 @@ def _sift(
         sigma=sigma,
         enable_precise_upscale=True,
     )
-    keypoints = sift.detect(gray, None)
+    keypoints = sift.detect(gray, mask)  # pyright: ignore[reportArgumentType, reportCallIssue]
     rows = np.array([(*k.pt, k.size, k.response, k.angle) for k in keypoints], np.float64).reshape(-1, 5)
     # OpenCV keeps float32 responses: a keypoint right at the threshold is over it
     strong = rows[:, 3] * _SIFT_LAYERS >= contrast * (1 - 1e-6)
@@ -162,7 +174,10 @@ def _sift(
 
 
 def _orb(
-    gray: UInt8[np.ndarray, "height width"], nfeatures: int, options: OrbOptions
+    gray: UInt8[np.ndarray, "height width"],
+    mask: UInt8[np.ndarray, "height width"] | None,
+    nfeatures: int,
+    options: OrbOptions,
 ) -> tuple[Any, UInt8[np.ndarray, "keypoints length"]]:
     import cv2
 
@@ -176,7 +191,7 @@ def _orb(
         patchSize=options.patch_px,
         fastThreshold=options.fast_threshold,
     )
-    keypoints, descriptors = orb.detectAndCompute(gray, None)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    keypoints, descriptors = orb.detectAndCompute(gray, mask)  # pyright: ignore[reportArgumentType, reportCallIssue]
     if descriptors is None:
         keypoints, descriptors = (), np.zeros((0, 32), np.uint8)
     return keypoints, descriptors if options.wta_k == 2 else _one_of_four(descriptors)
@@ -189,7 +204,9 @@ def _one_of_four(descriptors: UInt8[np.ndarray, "keypoints 32"]) -> UInt8[np.nda
     return (four[:, :, 0::2] | (four[:, :, 1::2] << 4)).reshape(len(descriptors), 64)
 
 
-def _akaze(gray: UInt8[np.ndarray, "height width"]) -> tuple[Any, UInt8[np.ndarray, "keypoints 61"]]:
+def _akaze(
+    gray: UInt8[np.ndarray, "height width"], mask: UInt8[np.ndarray, "height width"] | None
+) -> tuple[Any, UInt8[np.ndarray, "keypoints 61"]]:
     import cv2
 
     if not hasattr(cv2, "AKAZE_create"):
@@ -197,5 +214,5 @@ def _akaze(gray: UInt8[np.ndarray, "height width"]) -> tuple[Any, UInt8[np.ndarr
             f"detector akaze: OpenCV {cv2.__version__} has none in its main module; take sift or orb, "
             "or install opencv-python-headless<5."
         )
-    keypoints, descriptors = cv2.AKAZE_create().detectAndCompute(gray, None)  # pyright: ignore
+    keypoints, descriptors = cv2.AKAZE_create().detectAndCompute(gray, mask)  # pyright: ignore
     return (keypoints, descriptors) if descriptors is not None else ((), np.zeros((0, 61), np.uint8))

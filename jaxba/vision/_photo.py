@@ -1,10 +1,12 @@
 """A photo from its file: tags read, checked and put in the terms of `jaxba.scene.Photo`; no pixel is decoded."""
 
 import datetime
+from dataclasses import replace
 
 from jaxba._errors import JaxbaError
 from jaxba.scene import Photo, PhotoFile
 from jaxba.vision._attitude_tags import find_attitudes
+from jaxba.vision._cameras import camera_name, find_lens
 from jaxba.vision._exif import BASE, Tags, number, read_tags, text
 from jaxba.vision._focal import find_focal
 from jaxba.vision._position import find_position
@@ -45,13 +47,13 @@ def read_photo(file: PhotoFile, *, focal_px: float | None = None, max_focal_devi
     if orientation is not None and orientation not in range(1, 9):
         notes.append(f"Orientation {orientation:g} is none of 1 to 8 and counts as 1.")
         orientation = None
-    return Photo(
+    photo = Photo(
         name=file.name,
         path=file.path,
         sha256=file.sha256,
         width_px=tags.width_px,
         height_px=tags.height_px,
-        camera=_camera(tags, make, model, focal.focal_mm),
+        camera="",
         orientation=int(orientation or 1),
         make=make,
         model=model,
@@ -63,7 +65,9 @@ def read_photo(file: PhotoFile, *, focal_px: float | None = None, max_focal_devi
         flight_attitude=flight_attitude,
         notes=tuple(notes),
         original_size_px=_original_size(tags),
+        lens=find_lens(tags, make, model, focal.focal_mm),
     )
+    return replace(photo, camera=camera_name(photo))
 
 
 def _original_size(tags: Tags) -> tuple[int, int] | None:
@@ -78,22 +82,6 @@ def _note_size(tags: Tags, notes: list[str]) -> None:
             f"EXIF says {original[0]:.0f} x {original[1]:.0f} pixels, the file holds {tags.width_px} x "
             f"{tags.height_px}: it was resized or cropped, and the focal length follows the file."
         )
-
-
-def _camera(tags: Tags, make: str, model: str, focal_mm: float | None) -> str:
-    """Return the name that photos of one camera, at one zoom and size, share."""
-    name = model if model.lower().startswith(make.lower()) else f"{make} {model}"
-    serial = tags.text(BASE.BodySerialNumber) or text(tags.xmp.get("drone-dji:CameraSerialNumber"))
-    serial = serial or text(tags.xmp.get("aux:SerialNumber"))
-    lens = tags.text(BASE.LensModel) or text(tags.xmp.get("aux:Lens"))
-    parts = [name.strip() or "unknown camera"]
-    if serial.strip("0"):
-        parts.append(f"serial {serial}")
-    if lens and lens != model:
-        parts.append(lens)
-    if focal_mm:
-        parts.append(f"{focal_mm:.4g} mm")
-    return ", ".join([*parts, f"{tags.width_px}x{tags.height_px}"])
 
 
 def _time(tags: Tags, notes: list[str]) -> str | None:

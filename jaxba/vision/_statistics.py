@@ -30,6 +30,7 @@ from jaxtyping import Float, UInt8
 _SIDE_PX, _CELL_PX, _SQUARE_PX = 1200, 32, 192
 _FLAT_LEVELS = 3.0
 _CONCENTRATED, _PEAK, _RISE, _SECOND_RISE = 0.3, 0.1, 0.15, 0.3
+_LEAST_PX = 8  # sides in which nothing comes twice
 _FINE = 1 / 8  # of a square: what is coarser is no repetition in it
 _NEARLY_HIGHEST = 0.8  # the first peak that is this share of the highest is at one distance and not at two of them
 
@@ -91,6 +92,8 @@ def _repeats(square: Float[np.ndarray, "rows columns"]) -> bool:
     """Whether the edges of a square are parallel, or at right angles, and come at equal distances."""
     import cv2
 
+    if min(square.shape) < _LEAST_PX:
+        return False
     gx, gy = cv2.Sobel(square, cv2.CV_32F, 1, 0), cv2.Sobel(square, cv2.CV_32F, 0, 1)
     doubled = (gx + 1j * gy).astype(np.complex64) ** 2
     energy = np.abs(doubled)
@@ -116,10 +119,11 @@ def _has_two_peaks(profile: Float[np.ndarray, " shifts"]) -> bool:
     first = int(peaks[profile[peaks] >= _NEARLY_HIGHEST * profile[peaks].max()][0])
     rise = profile[first] - profile[rising[0]]
     around = max(2, first // 8)
-    low, high = 2 * first - around, 2 * first + around + 1
+    # a second peak lies behind the first, also where both are a few pixels long: a period of 2 px has peaks at 2 and 4
+    low, high = max(2 * first - around, first + 1), 2 * first + around + 1
     if rise < _RISE or high > len(profile):
         return False
-    second_rise = profile[low:high].max() - profile[first:low].min()
+    second_rise = profile[low:high].max() - profile[first : low + 1].min()
     return bool(profile[first] > _PEAK and second_rise > _SECOND_RISE * rise)
 
 

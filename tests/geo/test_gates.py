@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from geo_photos import photo, place
+from hypothesis import given, settings, strategies as st
 
 from jaxba.geo import Judgement, judge_positions, measured_positions
 from jaxba.scene import Position
@@ -52,7 +53,7 @@ def test_a_quiet_flight_is_used_whole():
     assert "No relative altitude tells the flight height" in judged.notes[0]
 
 
-def test_missing_far_and_inaccurate_positions_go_to_review_with_the_reason():
+def test_missing_and_far_positions_are_not_used_and_go_to_review_with_the_inaccurate_ones():
     photos = flight(300 + noise(20, 1.0))
     photos[3] = photo(3, None)
     photos[4] = photo(4, Position(x=0.0, y=0.0))
@@ -64,9 +65,27 @@ def test_missing_far_and_inaccurate_positions_go_to_review_with_the_reason():
     assert "no usable coordinates" in judged.review[1].reason
     assert "km from the middle of the survey, over 100 km" in judged.review[2].reason
     assert "states a horizontal accuracy of 2.50 m, over 2 m" in judged.review[3].reason
-    assert np.flatnonzero(~judged.is_used).tolist() == [3, 4, 5, 6]
-    assert judged.counts == {"missing coordinates": 2, "far from the others": 1, "horizontal accuracy": 1}
-    assert judge(photos, h_accuracy_threshold_m=3.0).is_used[6]
+    assert "the position is used with that sigma" in judged.review[3].reason
+    assert np.flatnonzero(~judged.is_used).tolist() == [3, 4, 5]
+    assert judged.counts == {"missing coordinates": 2, "far from the others": 1}
+    assert len(judge(photos, h_accuracy_threshold_m=3.0).review) == 3
+
+
+@given(
+    st.lists(st.one_of(st.none(), st.floats(0.05, 500)), min_size=4, max_size=12),
+    st.floats(0.05, 100),
+)
+@settings(max_examples=30)
+def test_an_honest_sigma_weighs_a_position_and_the_threshold_only_names_it(stated: list[float | None], limit_m: float):
+    photos = [
+        photo(k, Position(x=place(20.0 * k, 0)[0], y=46.8, z_m=300.0 + k % 2, std_h_m=std_m))
+        for k, std_m in enumerate(stated)
+    ]
+    measured, judged = measured_positions(photos), judge(photos, h_accuracy_threshold_m=limit_m)
+    assert judged.is_used.all()
+    assert measured.std_m[:, 0].tolist() == [3.0 if std_m is None else std_m for std_m in stated]
+    over = [photos[k].name for k, std_m in enumerate(stated) if std_m is not None and std_m > limit_m]
+    assert [left.name for left in judged.review] == over
 
 
 @pytest.mark.parametrize("share", [0.05, 0.1])
@@ -88,6 +107,21 @@ def test_a_frame_on_the_ground_goes_to_review_without_relative_altitudes():
     judged = judge(flight(heights))
     assert np.flatnonzero(~judged.is_used).tolist() == [0]
     assert "has a height of 240.0 m, " in judged.review[0].reason
+
+
+@pytest.mark.parametrize("num_below", [1, 10, 19])
+def test_heights_of_one_size_and_both_signs_are_named(num_below: int):
+    heights = 320 + noise(20, 1.0)
+    heights[:num_below] *= -1
+    judged = judge(flight(heights, np.full(20, 70.0)))
+    (note,) = [note for note in judged.notes if "below zero" in note]
+    assert f"Heights of {num_below} positions are about 320 m below zero (first: p000.jpg)" in note
+    assert f"of {20 - num_below} as much above (first: p{num_below:03d}.jpg)" in note
+
+
+@pytest.mark.parametrize("heights", [np.linspace(-30, 30, 20), np.full(20, -410.0), np.linspace(2, 40, 20)])
+def test_heights_about_or_below_sea_level_are_not(heights: np.ndarray):
+    assert not any("below zero" in note for note in judge(flight(heights, np.full(20, 70.0))).notes)
 
 
 def test_relative_altitudes_of_zero_are_no_flight_height():

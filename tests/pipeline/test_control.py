@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import ExifTags, Image, ImageOps
 
 from jaxba._errors import JaxbaError
 from jaxba.geo import projected_from_local
 from jaxba.pipeline import control, crs, metadata
+from jaxba.pipeline._mark_turn import TURNS, expected_px
 from jaxba.pipeline.control import Inputs, Outputs, Params
-from jaxba.scene import Photo, PhotoFile, Position, Reference
+from jaxba.scene import Attitude, Photo, PhotoFile, Position, Reference
 
 LON, LAT = -92.0, 46.8
 X, Y = 576308.6, 5183424.7
@@ -222,3 +224,114 @@ def test_points_without_names_keep_apart_in_two_lists_and_one_place_is_one_point
     lines = gcp_list().splitlines()
     both = run(unnamed(gcp_list()), check="\n".join(lines[:5])).control  # the first of them has a name there
     assert both.is_check.tolist() == [True, False, False, False] and len(both.mark_point) == 16
+
+
+def shown_marks(orientation: int, of: tuple[Photo, ...], xy_px: np.ndarray) -> np.ndarray:
+    """Return marks as Pillow shows them: where the one white pixel of a photo comes to lie."""
+    found = []
+    for x, y in xy_px:
+        stored = Image.new("L", (of[0].width_px // 10, of[0].height_px // 10))
+        stored.putpixel((int(x // 10), int(y // 10)), 255)
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        stored.getexif().update(exif)
+        row, column = np.argwhere(np.asarray(ImageOps.exif_transpose(stored)))[0]
+        found.append([10 * column + 5, 10 * row + 5])
+    return np.array(found, float)
+
+
+def looking_down(orientation: int, **changes: Any) -> tuple[Photo, ...]:
+    """Photos 62 m above the points, whose gimbal and focal length are known."""
+    down = Attitude(yaw_deg=20.0, pitch_deg=-90.0, roll_deg=0.0)
+    return photos(orientation=orientation, attitude=down, focal_px=1400.0, focal_source="given", **changes)
+
+
+def marked_down(orientation: int, of: tuple[Photo, ...], turn: int | None = None) -> tuple[str, np.ndarray]:
+    """Return a list with the marks of points near the photos as they are shown, and those on the stored grid."""
+    given = reference(of)
+    frame = given.frame
+    assert frame is not None
+    points = given.xyz_m[:, None] + [[5, -9, -62], [-8, 7, -62], [11, 3, -62], [-4, -11, -62]]
+    point, image = np.arange(16), np.repeat(np.arange(4), 4)
+    stored = expected_px(of, given, points.reshape(-1, 3), point, image)
+    stored = 10 * np.floor(stored / 10) + 5
+    shown = shown_marks(orientation if turn is None else turn, of, stored)
+    xyz = projected_from_local(frame, points.reshape(-1, 3))
+    rows = [f"{x} {y} {z} {u} {v} {of[k].name} p{j}" for j, k, (x, y, z), (u, v) in zip(point, image, xyz, shown)]  # noqa: B905
+    return "\n".join([frame.crs, *rows]), stored
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+def test_marks_set_in_photos_that_a_viewer_turned_are_refused_by_name_and_turned_back_as_asked(orientation: int):
+    of = looking_down(orientation)
+    text, stored = marked_down(orientation, of)
+    with pytest.raises(JaxbaError) as error:
+        run(text, of=of)
+    words = f"a.jpg: {orientation}, {TURNS[orientation]} by viewers"
+    assert words in str(error.value) and "marks count on the photos' stored pixel grid" in str(error.value)
+    assert "Set control.mark_orientation=exif to turn them back" in str(error.value)
+    for asked in ("exif", str(orientation)):
+        made = run(text, of=of, mark_orientation=asked)
+        np.testing.assert_allclose(made.control.mark_xy_px, stored)
+        assert f"control.mark_orientation={asked}" in " ".join(made.notes)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_marks_on_the_stored_grid_are_taken_whatever_the_orientation(orientation: int):
+    of = looking_down(orientation)
+    text, stored = marked_down(1, of)
+    made = run(text, of=of)
+    np.testing.assert_allclose(made.control.mark_xy_px, stored)
+    assert ("marks count on the stored pixel grid" in " ".join(made.notes)) == (orientation > 1)
+
+
+def test_photos_turned_each_in_its_own_way_are_told_from_a_turn_in_common():
+    of = tuple(replace(photo, orientation=o) for photo, o in zip(looking_down(1), (3, 6, 8, 1), strict=True))
+    texts = [marked_down(1, of, photo.orientation)[0].splitlines() for photo in of]
+    text = "\n".join([texts[0][0], *(texts[k // 4][1 + k] for k in range(16))])
+    with pytest.raises(JaxbaError, match=r"control\.mark_orientation=exif"):
+        run(text, of=of)
+    made = run(text, of=of, mark_orientation="exif")
+    np.testing.assert_allclose(made.control.mark_xy_px, marked_down(1, of)[1])
+
+
+@pytest.mark.parametrize("turn", range(2, 9))
+def test_a_turn_that_no_tag_states_is_named_with_its_number(turn: int):
+    """A yaw that is off looks like a turn, so that the marks are taken as they are where they lie inside."""
+    made = run(marked_down(1, looking_down(1), turn)[0], of=looking_down(1))
+    (note,) = [note for note in made.notes if "They fit if they were set in photos that were turned" in note]
+    assert TURNS[turn] in note and f"Set control.mark_orientation={turn} to turn them back" in note
+    assert "the attitudes may be wrong instead" in note
+
+
+def test_marks_outside_photos_that_a_program_has_untagged_are_refused_with_the_turn():
+    of = looking_down(1)
+    text, _ = marked_down(1, of, 6)
+    rows = [line.split() for line in text.splitlines()[1:]]
+    low = [
+        [*row[:4], str(float(row[4]) + 350), *row[5:]] for row in rows
+    ]  # up to 1400 of 1600 px, where 1200 are stored
+    with pytest.raises(
+        JaxbaError, match=r"EXIF orientation 6, turned by 90 degrees clockwise.*unturned, they lie outside"
+    ):
+        run("\n".join(["EPSG:32615", *map(" ".join, low)]), of=of)
+
+
+def test_without_attitudes_a_turn_shows_by_marks_outside():
+    of = photos(orientation=6)
+    tall = gcp_list().replace(" 700.0 ", " 1500.0 ").replace("1350.0", "1150.0")
+    with pytest.raises(JaxbaError, match=r"as their EXIF orientation says; unturned, they lie outside"):
+        run(tall, of=of)
+    assert len(run(tall, of=of, mark_orientation="exif").control.mark_point) == 16
+    assert "4 marked photos have an EXIF orientation other than 1" in " ".join(run(of=of).notes)
+
+
+def test_marks_of_larger_photos_are_turned_and_scaled():
+    of = looking_down(6, original_size_px=(4000, 3000))
+    text, stored = marked_down(6, of)
+    rows = [line.split() for line in text.splitlines()[1:]]
+    large = [[*row[:3], str(2.5 * float(row[3])), str(2.5 * float(row[4])), *row[5:]] for row in rows]
+    made = run("\n".join(["EPSG:32615", *map(" ".join, large)]), of=of, mark_orientation="exif")
+    np.testing.assert_allclose(made.control.mark_xy_px, stored)
+    made = run("\n".join(["EPSG:32615", *map(" ".join, large)]), of=of, mark_orientation="exif", mark_width_px=3000)
+    np.testing.assert_allclose(made.control.mark_xy_px, stored)

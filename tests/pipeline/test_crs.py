@@ -11,6 +11,7 @@ from pyproj import Transformer
 
 from jaxba._errors import JaxbaError
 from jaxba.pipeline import crs
+from jaxba.report import Told
 from jaxba.scene import Attitude, Photo, Position, Reference
 
 
@@ -157,21 +158,33 @@ def test_photos_without_position_or_height_stay_in_their_rows():
 
 def test_gated_positions_keep_their_coordinates_but_are_not_used():
     photos = survey(relative_altitude_m=50.0)
-    photos[3] = simple(3, at(3, relative_altitude_m=50.0, std_h_m=4.0))
+    photos[3] = simple(3, at(3, relative_altitude_m=65.0))
     found = reference(photos)
     assert np.isfinite(found.xyz_m[3]).all()
     assert np.flatnonzero(~found.is_used).tolist() == [3]
 
 
+@pytest.mark.parametrize("stated_m", [2.5, 7.65, 10.0, 40.0])
+@pytest.mark.parametrize("params", [{}, {"h_accuracy_threshold": 10.0}, {"h_accuracy_threshold": 100.0}])
+def test_positions_of_any_stated_accuracy_are_used_with_it(stated_m: float, params: dict[str, float]):
+    outputs = crs.run(crs.Inputs(photos=tuple(survey(std_h_m=stated_m))), crs.Params(**params))
+    found, limit_m = outputs.reference, params.get("h_accuracy_threshold", 2.0)
+    assert found.is_used.all()
+    assert found.std_m.tolist() == [[stated_m, stated_m, 2 * stated_m]] * 12
+    told = Told(photos=tuple(f"p{k:03d}.jpg" for k in range(12)))
+    said = f"12 photos (p000.jpg, p001.jpg, p002.jpg, ...): states a horizontal accuracy of {stated_m:.2f} m, over"
+    assert any(line.startswith(said) for line in crs.lines(outputs, told)) == (stated_m > limit_m)
+
+
 def test_too_few_positions_stop_the_stage_with_counts_and_cures():
     photos = [*survey(2), *[simple(2 + k, None) for k in range(3)]]
-    photos.append(simple(5, Position(x=-92.0, y=46.8, z_m=300.0, std_h_m=9.0)))
+    photos.append(simple(5, Position(x=92.0, y=46.8, z_m=300.0)))
     with pytest.raises(JaxbaError) as error:
         reference(photos)
     text = str(error.value)
     assert text.startswith("only 2 of 6 photos have a position that can be used, and crs.min_positions=3.")
-    assert "missing coordinates: 3; horizontal accuracy: 1 (first: p002.jpg has no usable coordinates" in text
-    assert "loosen crs.h_accuracy_threshold, crs.altitude_variance or crs.min_positions" in text
+    assert "missing coordinates: 3; far from the others: 1 (first: p002.jpg has no usable coordinates" in text
+    assert "loosen crs.altitude_variance or crs.min_positions" in text
     assert reference(photos, min_positions=2).is_used.sum() == 2
 
 
@@ -186,7 +199,7 @@ def test_a_projection_that_stretches_is_said():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("h_accuracy_threshold", 5.1), ("altitude_variance", 0.005), ("min_positions", 0)]
+    ("name", "value"), [("h_accuracy_threshold", 101.0), ("altitude_variance", 0.005), ("min_positions", 0)]
 )
 def test_gates_outside_their_range_are_refused(name: str, value: float):
     with pytest.raises(JaxbaError, match=rf"crs\.{name}={value} is out of range"):

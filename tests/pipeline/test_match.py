@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxba.pipeline import match
-from jaxba.report import pair_facts, pair_lines
+from jaxba.report import Told, pair_facts, pair_lines
 from jaxba.scene import EdgeStatus, Fallback, Features, Missed, Model, Photo, Reference, ViewGraph
 from jaxba.vision import Pixels, TwoView, decode, detect_features
 
@@ -114,6 +114,23 @@ def test_frame_without_texture_rejects_its_pairs(frames: list[Features]) -> None
     for pair in ([frames[0], black], [black, frames[0]], [black, black]):
         graph = match.run(inputs_of(pair), match.Params()).view_graph
         assert graph.status.tolist() == [EdgeStatus.REJECTED] and graph.num_putative.tolist() == [0]
+
+
+def test_a_pair_whose_common_ground_fails_is_matched_without_it_and_named(
+    frames: list[Features], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    inputs = inputs_of(frames[:3])
+    plain = match.run(inputs, match.Params())
+    monkeypatch.setattr(match, "common_ground", fail)
+    found = match.run(inputs, match.Params())
+    assert np.array_equal(found.view_graph.status, plain.view_graph.status)
+    assert plain.notes == () and len(found.notes) == len(found.view_graph.pairs)
+    assert "common ground could not be measured" in found.notes[0].reason
+    (line,) = [line for line in match.lines(found, Told()) if "common ground" in line]
+    assert "LinAlgError: Singular matrix" in line
 
 
 def test_few_inliers_make_a_weak_edge_and_fewer_none(frames: list[Features]) -> None:

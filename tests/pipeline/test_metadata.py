@@ -12,7 +12,7 @@ from jaxba._errors import JaxbaError
 from jaxba.pipeline import metadata
 from jaxba.scene import Attitude, PhotoFile
 
-BASE = ExifTags.Base
+BASE, GPS = ExifTags.Base, ExifTags.GPS
 
 
 def files_of(folder: Path) -> tuple[PhotoFile, ...]:
@@ -218,3 +218,79 @@ def test_tags_stay_beside_the_list_that_replaces_them(data_dir: Path):
     plain, listed = run(folder), run(folder, "EPSG:32615\nDJI_0018.JPG 576690 5188170 250\n")
     assert listed.photos[0].tag_position == plain.photos[0].position
     assert all(photo.tag_position is None for photo in (*plain.photos, *listed.photos[1:]))
+
+
+def test_one_finding_that_differs_in_its_figures_alone_is_one_line(tmp_path: Path):
+    for name, mm in (("a.jpg", 300), ("b.jpg", 400), ("c.jpg", -500)):
+        exif = Image.Exif()
+        gps = {GPS.GPSLatitude: (47.0, 0.0, 0.0), GPS.GPSLongitude: (8.0, 0.0, 0.0)}
+        gps |= {GPS.GPSLatitudeRef: "N", GPS.GPSLongitudeRef: "E", GPS.GPSAltitude: 300.0, GPS.GPSAltitudeRef: b"\0"}
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
+        height = f"<d:AbsoluteAltitude>{mm / 1000 + 310:+}</d:AbsoluteAltitude>"
+        xmp = f'<a xmlns:d="http://www.dji.com/drone-dji/1.0/">{height}</a>'
+        Image.new("L", (40, 30)).save(tmp_path / name, exif=exif, xmp=xmp.encode())
+    (note,) = [note for note in run(tmp_path).notes if "AbsoluteAltitude" in note]
+    assert note.startswith("a.jpg, b.jpg, c.jpg: the height of EXIF lies 9.50 to 10.40 m below that of XMP's Absolute")
+
+
+@pytest.mark.parametrize(
+    ("photo", "mask"),
+    [
+        ("a.jpg", "a_mask.png"),
+        ("a.jpg", "A_MASK.JPG"),
+        ("a.jpg", "a.jpg_mask.png"),
+        ("a.jpg", "masks/a.jpg.png"),
+        ("a.jpg", "Masks/a.png"),
+        ("a.jpg", "masks/a_mask.tif"),
+        ("sub/a.jpg", "masks/sub/a.jpg.png"),
+        ("sub/a.jpg", "sub/masks/a.png"),
+        ("images/a.jpg", "masks/a.jpg.png"),
+    ],
+)
+def test_a_mask_belongs_to_its_photo_and_is_no_photo(tmp_path: Path, photo: str, mask: str):
+    write(tmp_path / photo)
+    write(tmp_path / "other.jpg", gray=9)
+    (tmp_path / mask).parent.mkdir(parents=True, exist_ok=True)
+    Image.new("L", (500, 333), 255).save(tmp_path / mask)
+    outputs = run(tmp_path)
+    assert {p.name: p.mask and p.mask.name for p in outputs.photos} == {photo: mask, "other.jpg": None}
+    assert outputs.notes[0] == (
+        f"1 of 2 photos have a mask ({photo}: {mask}, ...): no features are taken where it is black."
+    )
+
+
+@pytest.mark.parametrize("mask", ["b_mask.png", "masks/b.jpg.png", "masks/readme.png"])
+def test_a_mask_of_no_photo_is_passed_over_and_named(tmp_path: Path, mask: str):
+    write(tmp_path / "a.jpg")
+    (tmp_path / mask).parent.mkdir(parents=True, exist_ok=True)
+    Image.new("L", (10, 10)).save(tmp_path / mask)
+    outputs = run(tmp_path)
+    assert [p.name for p in outputs.photos] == ["a.jpg"] and outputs.left_out == ()
+    assert outputs.notes == (f"Masks of no photo are passed over, 1: {mask}.",)
+
+
+def test_photos_that_are_called_like_masks_are_photos_where_there_are_no_others(tmp_path: Path):
+    write(tmp_path / "a_mask.jpg")
+    assert [p.name for p in run(tmp_path).photos] == ["a_mask.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("size_px", "words"),
+    [
+        ((1000, 800), "a_mask.png has 1000 x 800 pixels and a.jpg 1000 x 667; draw it in the photo, or remove it"),
+        ((667, 1000), "it is turned; masks count on the pixels as they are stored"),
+    ],
+)
+def test_a_mask_of_another_format_is_refused_with_both_sizes(tmp_path: Path, size_px: tuple[int, int], words: str):
+    write(tmp_path / "a.jpg")
+    Image.new("L", size_px).save(tmp_path / "a_mask.png")
+    with pytest.raises(JaxbaError, match=f"1 of 1 masks do not fit their photos: .*{words}"):
+        run(tmp_path)
+
+
+def test_two_masks_of_one_photo_are_refused(tmp_path: Path):
+    write(tmp_path / "a.jpg")
+    for name in ("a_mask.png", "a_mask.jpg"):
+        Image.new("L", (1000, 667), 255).save(tmp_path / name)
+    with pytest.raises(JaxbaError, match=r"a\.jpg has two masks, a_mask\.jpg and a_mask\.png; keep one"):
+        run(tmp_path)

@@ -171,3 +171,17 @@ def test_position_sigmas_are_those_of_the_axes_that_were_measured(adjusted: Adju
     fit = gnss_fit(adjusted.block, without_heights)
     found = _by_kind(findings(adjusted, survey.block, sigmas, fit, without_heights, survey.photos))
     assert found["common offset"] == {"median_m": 0.03, "receiver_std_m": 3.0} and "nan" not in str(found)
+
+
+def test_a_finding_that_fails_costs_nothing_but_itself(
+    adjusted: Adjusted, survey: Simulated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: object) -> None:
+        raise IndexError("index 7 is out of bounds")
+
+    monkeypatch.setattr("jaxba.sfm._findings._scatter", fail)
+    found = _findings(
+        adjusted, survey, replace(survey.reference, height_above_ground_m=height_above_ground(adjusted.block))
+    )
+    assert list(found) == ["note"]
+    assert "Scatter of positions could not be measured" in found["note"]["text"] and "index 7" in found["note"]["text"]

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
@@ -18,6 +19,7 @@ NAMESPACES = {
     "Camera": "http://pix4d.com/camera/1.0/",
     "sensefly": "http://ns.sensefly.com/Camera/1.0/",
     "tiff": "http://ns.adobe.com/tiff/1.0/",
+    "exif": "http://ns.adobe.com/exif/1.0/",
 }
 NORTH_EAST: dict[int, Any] = {
     ExifTags.GPS.GPSLatitudeRef: "N",
@@ -31,7 +33,7 @@ NORTH_EAST: dict[int, Any] = {
 def xmp_packet(values: Mapping[str, str]) -> bytes:
     """Return a packet with the values as attributes, as drones write them."""
     spaces = " ".join(f'xmlns:{prefix}="{uri}"' for prefix, uri in NAMESPACES.items())
-    words = " ".join(f'{name}="{value}"' for name, value in values.items())
+    words = " ".join(f"{name}={quoteattr(value)}" for name, value in values.items())
     rdf = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
     return (
         f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="{rdf}"><rdf:Description rdf:about="" {spaces} '

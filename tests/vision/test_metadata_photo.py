@@ -7,7 +7,7 @@ from PIL import ExifTags, Image
 from tagged_photos import NORTH_EAST, file_of, tagged, write_photo, xmp_packet
 
 from jaxba._errors import JaxbaError
-from jaxba.vision import read_photo
+from jaxba.vision import read_photo, shared_cameras
 from jaxba.vision._sensors import _ROWS
 from jaxba.vision._xmp import BrokenXmp, parse_xmp
 
@@ -113,6 +113,86 @@ def test_camera_is_told_by_model_serial_lens_zoom_and_size(tmp_path: Path):
     ):
         assert tagged(tmp_path, **change).camera != first
     assert tagged(tmp_path, (300, 400), **same).camera != first
+
+
+ONE = {
+    "make": "DJI", "model": "Multi", "base": {}, "xmp": {},
+    "exif": {BASE.FocalLength: 4.5, BASE.BodySerialNumber: "17", BASE.LensModel: "5.0-25.0 mm"},
+}  # fmt: skip
+"""Tags of a camera that no table knows."""
+
+
+def cameras(folder: Path, *changes: dict) -> tuple[list[str], list[str]]:
+    """Return the cameras of photos with `ONE`'s tags changed by group, and the notes on them."""
+    photos = []
+    for change in changes:
+        tags = {k: {**v, **change.get(k, {})} if isinstance(v, dict) else change.get(k, v) for k, v in ONE.items()}
+        photos.append(tagged(folder, **tags))
+    shared, notes = shared_cameras(photos)
+    return [photo.camera for photo in shared], notes
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"exif": {BASE.DigitalZoomRatio: 2.0}},
+        {"exif": {BASE.DigitalZoomRatio: 1.1}},
+        {"exif": {BASE.FocalLengthIn35mmFilm: 48}},
+        {"exif": {BASE.FocalLength: 4.7}},
+        {"exif": {BASE.FocalLength: 29.8}},
+        {"exif": {BASE.LensModel: "5.0-25.5 mm"}},
+        {"exif": {BASE.LensModel: ""}},
+        {"exif": {0xA435: "0042"}},
+        {"exif": {BASE.BodySerialNumber: "18"}},
+        {"xmp": {"Camera:BandName": "NIR"}},
+        {"xmp": {"sensefly:RigCameraIndex": "1"}},
+        {"xmp": {"drone-dji:ImageSource": "ZoomCamera"}},
+        {"xmp": {"Camera:PerspectiveFocalLength": "1500", "Camera:PerspectiveFocalLengthUnits": "pixel"}},
+        {"model": "Multi 2"},
+    ],
+)
+def test_whatever_tells_lenses_apart_makes_two_cameras(tmp_path: Path, change: dict):
+    stated = {"exif": {BASE.FocalLengthIn35mmFilm: 24, BASE.ExifImageWidth: 400, BASE.ExifImageHeight: 300}}
+    names, notes = cameras(tmp_path, stated, {**change, "exif": {**stated["exif"], **change.get("exif", {})}}, stated)
+    assert names[0] == names[2] != names[1] and notes == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"exif": {BASE.FocalLength: 4.49}},
+        {"exif": {BASE.FocalLength: 4.52}},
+        {"exif": {BASE.DigitalZoomRatio: 1.0}},
+        {"exif": {BASE.DigitalZoomRatio: 0.0}},
+        {"exif": {BASE.FocalLengthIn35mmFilm: 25}},
+        {"exif": {BASE.LensModel: "5.0 - 25.0 mm"}},
+        {"exif": {BASE.LensModel: "5-25MM"}},
+        {"exif": {BASE.LensModel: "5.0 -25.0  mm\x00\x00"}},
+        {"exif": {BASE.BodySerialNumber: " 17 \x00"}},
+        {"make": "Dji", "model": "multi "},
+    ],
+)
+def test_rounding_and_spelling_tell_no_cameras_apart(tmp_path: Path, change: dict):
+    stated = {"exif": {BASE.FocalLengthIn35mmFilm: 24}}
+    names, notes = cameras(tmp_path, stated, stated, {**change, "exif": {**stated["exif"], **change.get("exif", {})}})
+    assert set(names) == {"DJI Multi, serial 17, 5.0-25.0 mm, 4.5 mm, 400x300"}
+    assert all("written in 2 ways and counts as one: 'DJI Multi, serial 17, 5.0-25.0 mm' (2) and" in n for n in notes)
+
+
+def test_bands_of_a_rig_and_zooms_are_named_after_what_tells_them_apart(tmp_path: Path):
+    rig = [{"xmp": {"Camera:BandName": band, "Camera:RigCameraIndex": str(k)}} for k, band in enumerate(("Red", "NIR"))]
+    zoomed = {"exif": {BASE.DigitalZoomRatio: 2.0}}
+    assert cameras(tmp_path, *rig, zoomed, {})[0] == [
+        "DJI Multi, serial 17, 5.0-25.0 mm, band Red, rig camera 0, 4.5 mm, 400x300",
+        "DJI Multi, serial 17, 5.0-25.0 mm, band NIR, rig camera 1, 4.5 mm, 400x300",
+        "DJI Multi, serial 17, 5.0-25.0 mm, 4.5 mm, 2x digital zoom, 400x300",
+        "DJI Multi, serial 17, 5.0-25.0 mm, 4.5 mm, 400x300",
+    ]
+
+
+def test_a_lens_that_creeps_is_no_chain_of_one_camera(tmp_path: Path):
+    creeping = [{"exif": {BASE.FocalLength: 4.5 * 1.008**k}} for k in range(6)]
+    assert len(set(cameras(tmp_path, *creeping)[0])) == 3
 
 
 def test_orientation_out_of_range_is_noted(tmp_path: Path):

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 from PIL import ExifTags
 from PIL.TiffImagePlugin import IFDRational
 from tagged_photos import NORTH_EAST, file_of, tagged
 
 from jaxba.scene import Attitude, cam_from_enu
 from jaxba.vision import attitude_from_nadir_body, read_photo
+from jaxba.vision._position import parse_angle
 
 GPS = ExifTags.GPS
 ALTITUDE = {GPS.GPSAltitude: 431.5, GPS.GPSAltitudeRef: b"\x00"}
@@ -157,10 +159,133 @@ def test_impossible_position_counts_as_absent_and_is_named(tmp_path: Path, chang
     assert note in " ".join(photo.notes)
 
 
-def test_missing_hemisphere_is_assumed_and_said(tmp_path: Path):
-    photo = tagged(tmp_path, gps={tag: value for tag, value in NORTH_EAST.items() if tag != GPS.GPSLongitudeRef})
-    assert photo.position is not None and photo.position.x == 8.25
-    assert "E is assumed" in " ".join(photo.notes)
+@pytest.mark.parametrize(
+    ("letter", "in_xmp", "x", "words"),
+    [
+        (None, {}, 8.25, "EXIF has no GPSLongitudeRef, and nothing else states it: E is assumed"),
+        ("", {}, 8.25, "E is assumed"),
+        ("?", {}, 8.25, "GPSLongitudeRef '?' is neither E nor W"),
+        (None, {"drone-dji:GpsLongitude": "-8.25"}, -8.25, "EXIF has no GPSLongitudeRef: W is taken from XMP"),
+        (None, {"drone-dji:GpsLongtitude": "-8.2503"}, -8.25, "W is taken from XMP"),
+        (None, {"drone:GpsLongtitude": "8.25"}, 8.25, "E is taken from XMP"),
+        (None, {"exif:GPSLongitude": "8,15.0W"}, -8.25, "W is taken from XMP's exif tags"),
+        ("E", {"drone-dji:GpsLongitude": "-8.25"}, -8.25, "EXIF says E (GPSLongitudeRef) and XMP says W"),
+        ("W", {"drone-dji:GpsLongitude": "+8.25"}, 8.25, "EXIF says W (GPSLongitudeRef) and XMP says E"),
+        ("W", {"drone:Longitude": "8.25"}, -8.25, ""),  # a maker that leaves signs out
+        ("E", {"drone-dji:GpsLongitude": "-9.5"}, 8.25, "XMP 47.5100000, -9.5000000; EXIF is used"),
+        ("W", {"drone-dji:GpsLongitude": "-8.25"}, -8.25, ""),
+    ],
+)
+def test_a_hemisphere_is_taken_from_where_it_is_stated(
+    tmp_path: Path, letter: str | None, in_xmp: dict[str, str], x: float, words: str
+):
+    gps = {**NORTH_EAST, GPS.GPSLongitudeRef: letter}
+    latitude = {"exif:GPSLatitude": "47,30.6N"} if "exif:GPSLongitude" in in_xmp else {"drone:GpsLatitude": "47.51"}
+    xmp = {**latitude, **in_xmp} if in_xmp else None
+    photo = tagged(tmp_path, gps={tag: value for tag, value in gps.items() if value is not None}, xmp=xmp)
+    assert photo.position is not None and photo.position.x == pytest.approx(x)
+    assert (words in " ".join(photo.notes)) if words else photo.notes[1:] == (), photo.notes
+
+
+def test_a_southern_latitude_is_taken_from_xmp_too(tmp_path: Path):
+    xmp = {"drone-dji:GpsLatitude": "-47.51", "drone-dji:GpsLongitude": "8.25"}
+    gps = {tag: value for tag, value in NORTH_EAST.items() if tag not in (GPS.GPSLatitudeRef, GPS.GPSLongitudeRef)}
+    photo = tagged(tmp_path, gps=gps, xmp=xmp)
+    assert photo.position is not None and (photo.position.y, photo.position.x) == (-47.51, 8.25)
+    assert "S is taken from XMP" in " ".join(photo.notes) and "E is taken from XMP" in " ".join(photo.notes)
+
+
+@pytest.mark.parametrize(
+    ("z_m", "ref", "in_xmp", "height_m", "words"),
+    [
+        (320.55, 1, {"drone-dji:AbsoluteAltitude": "+320.55"}, 320.55, "below sea level (GPSAltitudeRef 1), XMP's"),
+        (320.55, 1, {"drone:AbsoluteAltitude": "320.55"}, 320.55, "below sea level (GPSAltitudeRef 1), XMP's"),
+        (320.0, 1, {"drone-dji:AbsoluteAltitude": "+320.55"}, 320.55, "below sea level"),
+        (320.5, 3, {"drone-dji:AbsoluteAltitude": "+320.55"}, 320.55, "GPSAltitudeRef 3"),
+        (2.5, 0, {"drone-dji:AbsoluteAltitude": "-2.50"}, -2.5, "above sea level (GPSAltitudeRef 0), XMP's"),
+        (2.5, None, {"drone-dji:AbsoluteAltitude": "-2.50"}, -2.5, "EXIF has no GPSAltitudeRef: the sign"),
+        (320.55, 1, {"drone-dji:AbsoluteAltitude": "+352.55"}, 320.55, "32.00 m below that of XMP's AbsoluteAltitude"),
+        (12.0, 1, {"drone-dji:AbsoluteAltitude": "+35.00"}, -12.0, "47.00 m below that of XMP's AbsoluteAltitude"),
+        (431.5, 0, {"drone-dji:AbsoluteAltitude": "+431.70"}, 431.5, "0.20 m below that of XMP's AbsoluteAltitude"),
+        (431.52, 0, {"drone-dji:AbsoluteAltitude": "+399.17"}, 431.52, "32.35 m above that of XMP's AbsoluteAltitude"),
+        (431.0, 0, {"drone-dji:AbsoluteAltitude": "+431.70"}, 431.7, ""),
+        (431.5, 1, {"exif:GPSAltitude": "863/2", "exif:GPSAltitudeRef": "0"}, 431.5, "XMP's exif:GPSAltitude puts it"),
+        (431.5, None, {"exif:GPSAltitude": "863/2", "exif:GPSAltitudeRef": "1"}, -431.5, "the sign of its height"),
+        (431.5, 1, {"exif:GPSAltitude": "863/2"}, -431.5, ""),
+        (431.5, 0, {"drone-dji:RelativeAltitude": "+80.10"}, 431.5, ""),  # another thing
+    ],
+)
+def test_heights_of_exif_and_xmp_are_compared_and_a_sign_is_taken_from_where_it_is_stated(
+    tmp_path: Path, z_m: float, ref: int | None, in_xmp: dict[str, str], height_m: float, words: str
+):
+    altitude = {GPS.GPSAltitude: z_m} | ({} if ref is None else {GPS.GPSAltitudeRef: bytes([ref])})
+    photo = tagged(tmp_path, gps={**NORTH_EAST, **altitude}, xmp=in_xmp)
+    assert photo.position is not None and photo.position.z_m == pytest.approx(height_m)
+    notes = [note for note in photo.notes if "focal" not in note]
+    assert (words in " ".join(notes)) if words else notes == [], notes
+
+
+def as_degrees(deg: float, axis: str) -> dict[str, str]:
+    """Return an angle in each of the forms in which programs write it into XMP."""
+    size, letter = abs(deg), ("NS" if axis == "Latitude" else "EW")[deg < 0]
+    whole, minutes = int(size), 60 * (size - int(size))
+    seconds = 60 * (minutes - int(minutes))
+    return {
+        "decimal minutes": f"{whole},{minutes:.9f}{letter}",
+        "whole seconds": f"{whole},{int(minutes)},{seconds:.6f}{letter}",
+        "letter first": f"{letter} {whole} {minutes:.9f}",
+        "decimal": f"{size:.10f}{letter}",
+        "signed": f"{deg:+.10f}",
+        "words": f"{whole} deg {int(minutes)}' {seconds:.6f}\" {letter}",
+        "degree signs": f"{whole}\u00b0{int(minutes)}\u2032{seconds:.6f}\u2033{letter.lower()}",
+        "ratios": f"{whole}/1, {int(minutes)}/1, {round(seconds * 1e6)}/1000000 {letter}",
+    }
+
+
+@given(
+    st.floats(-89.9, 89.9).filter(lambda deg: abs(deg) > 1e-6),
+    st.floats(-179.9, 179.9).filter(lambda deg: abs(deg) > 1e-6),
+)
+@settings(max_examples=40)
+def test_every_form_of_an_angle_in_plain_xmp_is_read(latitude: float, longitude: float):
+    for deg, axis, letters in ((latitude, "Latitude", "NS"), (longitude, "Longitude", "EW")):
+        for form, words in as_degrees(deg, axis).items():
+            found = parse_angle(words, letters)
+            assert found is not None, (form, words)
+            assert found[0] == pytest.approx(deg, abs=2e-9) and found[1], (form, words)  # 1e-6 seconds are 3e-10
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["", "N", "north", "44,8999N", "44,53,60.1N", "44,-53N", "44,53,59,1N", "44/0,53N", "-44,53N", "nan", "4 4e"],
+)
+def test_what_is_no_angle_counts_as_absent(tmp_path: Path, words: str):
+    assert parse_angle(words, "NS") is None
+    photo = tagged(tmp_path, xmp={"exif:GPSLatitude": words, "exif:GPSLongitude": "93,12.0W"})
+    assert photo.position is None
+    assert (f"exif:GPSLatitude {words!r} is no angle" in " ".join(photo.notes)) == bool(words)
+
+
+@pytest.mark.parametrize(
+    ("change", "y", "z_m", "kind"),
+    [
+        ({}, 44.8999, 320.4, "mean_sea_level"),
+        ({"exif:GPSAltitudeRef": "1"}, 44.8999, -320.4, "mean_sea_level"),
+        ({"exif:GPSAltitudeRef": "2", "exif:GPSAltitude": "320.4"}, 44.8999, 320.4, "ellipsoidal"),
+        ({"exif:GPSLatitude": "44.8999", "exif:GPSLatitudeRef": "S"}, -44.8999, 320.4, "mean_sea_level"),
+        ({"exif:GPSAltitude": "n/a"}, 44.8999, None, "mean_sea_level"),
+    ],
+)
+def test_position_in_plain_xmp_alone(tmp_path: Path, change: dict[str, str], y: float, z_m: float | None, kind: str):
+    xmp = {
+        "exif:GPSLatitude": "44,53.994N", "exif:GPSLongitude": "93,11.98687482W", "exif:GPSAltitude": "1602/5",
+        "exif:GPSAltitudeRef": "0", "exif:GPSHPositioningError": "5/2",
+    }  # fmt: skip
+    position = tagged(tmp_path, xmp={**xmp, **change}).position
+    assert position is not None
+    assert (position.y, position.x) == (pytest.approx(y), pytest.approx(-93.199781247))
+    assert (position.z_m, position.height_kind, position.std_h_m) == (z_m, kind, 2.5)
+    assert position.source == "XMP"
 
 
 def test_height_with_a_zero_denominator_counts_as_absent(tmp_path: Path):

@@ -3,8 +3,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
 
 from jaxba.vision import decode, measure_image
+from jaxba.vision._statistics import _has_two_peaks
 
 
 def noise(height: int = 600, width: int = 800, sigma_px: float = 1.5, levels: float = 30.0) -> np.ndarray:
@@ -54,6 +57,36 @@ def test_water_is_flat_in_spite_of_sensor_noise_and_a_gradient_of_light() -> Non
     assert measure_image(as_gray(noise())).flat_share == 0
     shore = np.where(x < 400, water, noise())
     assert measure_image(as_gray(shore)).flat_share == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("period_px", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("duty_px", [1, 2])
+@pytest.mark.parametrize("kind", ["columns", "rows", "checks"])
+def test_patterns_of_a_few_pixels_are_measured(period_px: int, duty_px: int, kind: str) -> None:
+    x = np.where(np.arange(400) % period_px < duty_px, 200.0, 40.0)
+    pattern = {"columns": np.tile(x, (400, 1)), "rows": np.tile(x[:, None], 400), "checks": np.abs(x[:, None] - x)}
+    found = measure_image(as_gray(pattern[kind] + 0.2 * noise(400, 400)))
+    assert 0 <= found.repeating_share <= 1
+
+
+@given(hnp.arrays(float, st.integers(4, 96), elements=st.floats(-1, 1)))
+@settings(max_examples=200)
+def test_any_autocorrelation_has_two_peaks_or_has_not(profile: np.ndarray) -> None:
+    assert _has_two_peaks(profile) in (True, False)
+
+
+@pytest.mark.parametrize("period", [2, 3, 4, 8])
+def test_a_pattern_of_any_period_has_two_peaks(period: int) -> None:
+    profile = np.where(np.arange(48) % period == 0, 0.9, 0.0)
+    assert _has_two_peaks(profile)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (2, 2), (3, 191), (17, 900), (200, 200)])
+@pytest.mark.parametrize("seed", range(3))
+def test_frames_of_any_shape_are_measured(shape: tuple[int, int], seed: int) -> None:
+    frame = np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
+    found = measure_image(frame)
+    assert 0 <= found.flat_share <= 1 and 0 <= found.repeating_share <= 1
 
 
 def test_brightness_is_the_mean() -> None:

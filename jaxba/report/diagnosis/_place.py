@@ -225,11 +225,12 @@ def contradicting_gnss(case: Recorded) -> Diagnosis | None:
             f"({done.photos[last].name}) in one flight, over {np.ptp(z[order]):.1f} m, which neither the ground nor "
             "the flight explains; no height is used"
         )
-    if len(reference.review) > _OUTLIERS * len(used):
-        figures["review"] = [left.name for left in reference.review]
+    names = {photo.name for photo, is_used in zip(done.photos, used, strict=True) if not is_used}
+    unused = [left for left in reference.review if left.name in names]
+    if len(unused) > _OUTLIERS * len(used):
+        figures["review"] = [left.name for left in unused]
         texts.append(
-            f"{len(reference.review)} of {len(used)} positions are not used ({reference.review[0].name} "
-            f"{reference.review[0].reason.rstrip('.')})"
+            f"{len(unused)} of {len(used)} positions are not used ({unused[0].name} {unused[0].reason.rstrip('.')})"
         )
     if _is_sound(case):
         texts += _against_photos(case, figures)

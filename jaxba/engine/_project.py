@@ -21,7 +21,7 @@ from typing import Any
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._store import sha256
-from jaxba.io import cannot_write, remove_leftovers, write_atomically
+from jaxba.io import cannot_write, remove_leftovers, text_of, write_atomically
 from jaxba.scene import PhotoFile
 
 SETTINGS, SUMMARY = "jaxba.toml", "summary.json"
@@ -165,7 +165,7 @@ def _read_list(path: Path | None, kind: str) -> tuple[str, str] | None:
     if not path.is_file():
         raise JaxbaError(f"{path}: there is no such file; give {kind}.")
     try:
-        return str(path.name), path.read_text(encoding="utf-8-sig")
+        return str(path.name), text_of(path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
         raise JaxbaError(f"{path}: cannot be read as text ({error}); give {kind} in UTF-8.") from error
 

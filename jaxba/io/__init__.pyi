@@ -32,6 +32,7 @@ from ._las import write_las as write_las
 from ._opensfm import write_opensfm as write_opensfm
 from ._ply import write_ply as write_ply
 from ._problem import read_problem as read_problem
+from ._read import text_of as text_of
 from ._read_colmap import ColmapModel as ColmapModel, read_colmap_text as read_colmap_text
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
 from ._sites import Sites as Sites, make_sites as make_sites

@@ -24,7 +24,7 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem
 from jaxba.geometry import BAL, Pose
 from jaxba.io._atomic import write_atomically
-from jaxba.io._read import read_bytes
+from jaxba.io._read import read_bytes, text_of
 
 _BZ2_MAGIC = b"BZh"
 _D = np.array([1.0, -1.0, -1.0])
@@ -50,6 +50,7 @@ def read_bal(path: str | os.PathLike[str]) -> Problem:
             data = bz2.decompress(data)
         except (OSError, ValueError, EOFError) as error:
             raise JaxbaError(f"{label}: damaged or truncated bz2 ({error}); {_AGAIN}.") from error
+    data = text_of(data, "replace").encode()  # without a byte order mark
     values = _numbers(data, label)
     num_images, num_points, num_observations = _counts(values, data, label)
     end_observations = 3 + 4 * num_observations

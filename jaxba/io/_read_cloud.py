@@ -15,7 +15,7 @@ from jaxba._errors import JaxbaError
 from jaxba.io._cloud import Cloud
 from jaxba.io._csv_cloud import COLUMNS
 from jaxba.io._ply import PLY_TYPES, VERTEX
-from jaxba.io._read import read_bytes
+from jaxba.io._read import read_bytes, text_of
 
 _FORMAT = b"ply\nformat binary_little_endian 1.0\n"
 _END = b"end_header\n"
@@ -40,7 +40,7 @@ def read_csv_cloud(path: str | os.PathLike[str]) -> CloudFile:
         JaxbaError: a column is missing or not known, a row is damaged, or rows have codes of several CRSs.
     """
     label = os.fspath(path)
-    lines = csv.reader(read_bytes(path).decode("utf-8", "replace").splitlines(), quoting=csv.QUOTE_NONE)
+    lines = csv.reader(text_of(read_bytes(path), "replace").splitlines(), quoting=csv.QUOTE_NONE)
     try:
         header, *cells = lines
     except csv.Error as error:

@@ -83,6 +83,8 @@ def test_geotags_are_those_given_else_geo_txt_among_the_photos(photos: Path, tmp
     (tmp_path / "other.csv").write_text("EPSG:32615\n")
     assert read_geotags(photos) == ("geo.txt", "EPSG:4326\n")
     assert read_geotags(photos, tmp_path / "other.csv") == ("other.csv", "EPSG:32615\n")
+    (tmp_path / "wide.csv").write_bytes("EPSG:32615\n".encode("utf-16"))  # as spreadsheets write "Unicode text"
+    assert read_geotags(photos, tmp_path / "wide.csv") == ("wide.csv", "EPSG:32615\n")
     (tmp_path / "latin.csv").write_bytes("Höhe".encode("latin-1"))
     with pytest.raises(JaxbaError, match=r"latin\.csv: cannot be read as text .* in UTF-8"):
         read_geotags(photos, tmp_path / "latin.csv")

@@ -203,3 +203,9 @@ def test_missing_file_and_folder_are_named(tmp_path: Path):
             read(tmp_path / "none.txt")
         with pytest.raises(JaxbaError, match="is a folder; give a file in it"):
             read(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_and_blank_lines_are_passed_over(tmp_path: Path, encoding: str):
+    (tmp_path / "marked.txt").write_bytes(f"\n{TOY}\n\n".replace("\n", "\r\n\n").encode(encoding))
+    assert eqx.tree_equal(read_bal(tmp_path / "marked.txt"), read_bal(toy(tmp_path)))

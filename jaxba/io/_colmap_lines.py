@@ -25,6 +25,13 @@ def finite(words: Sequence[str]) -> list[float]:
     return numbers
 
 
+def unit(quaternion: Sequence[float]) -> list[float]:
+    """Return a quaternion that is not zero as one of unit length, however long or short it is."""
+    largest = max(map(abs, quaternion))
+    scaled = [value / largest for value in quaternion]
+    return [value / math.hypot(*scaled) for value in scaled]
+
+
 def claim(places: dict[int, str], number: int, place: str, kind: str) -> None:
     """Note where an id stands; raises `JaxbaError` where it stands in two places."""
     before = places.setdefault(number, place)

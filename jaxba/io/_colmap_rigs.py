@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
-from jaxba.io._colmap_lines import Damage, claim, content_lines, finite
+from jaxba.io._colmap_lines import Damage, claim, content_lines, finite, unit
 
 _TOLERANCE = 1e-5  # rad, and of a translation's length: texts of six digits round by a tenth of it
 _CAMERA = "CAMERA"
@@ -81,7 +81,7 @@ def refuse_other_poses(folder: Path, images: Sequence[tuple[str, int, int, list[
         if frame_camera != camera_id:
             raise JaxbaError(f"{place}: image {image_id} has camera {camera_id}, and {frame_camera} in {frame_place}.")
         angle, shift = _difference(expected, pose)
-        if angle > _TOLERANCE or shift > _TOLERANCE * (1 + np.linalg.norm(expected.translation)):
+        if angle > _TOLERANCE or shift > _TOLERANCE * (1 + float(np.abs(expected.translation).max())):
             raise JaxbaError(
                 f"{place}: the pose of image {image_id} does not follow from rigs.txt and frames.txt ({frame_place}): "
                 f"it is turned by {np.degrees(angle):.3g} degrees and shifted by {shift:.3g}; export the model again."
@@ -113,14 +113,17 @@ def _rigs(path: Path) -> dict[int, dict[int, _Transform]]:
 
 
 def _transform(words: Sequence[str]) -> _Transform:
-    numbers = np.array(finite(words))
-    if numbers.shape != (7,) or not numbers[:4].any():
+    numbers = finite(words)
+    if len(numbers) != 7 or not any(numbers[:4]):
         raise ValueError(f"{' '.join(words)} is no quaternion, not all zero, and translation")
-    return _Transform(rotation=Rotation.from_quat(numbers[:4], scalar_first=True), translation=numbers[4:])
+    return _Transform(
+        rotation=Rotation.from_quat(np.array(unit(numbers[:4])), scalar_first=True), translation=np.array(numbers[4:])
+    )
 
 
 def _difference(expected: _Transform, pose: Sequence[float]) -> tuple[float, float]:
     """Return the angle, radians, and the distance between two poses."""
-    rotation = Rotation.from_quat(np.array(pose[:4]), scalar_first=True)
+    rotation = Rotation.from_quat(np.array(unit(pose[:4])), scalar_first=True)
     angle = float((rotation * expected.rotation.inv()).magnitude())
-    return angle, float(np.linalg.norm(np.array(pose[4:]) - expected.translation))
+    with np.errstate(over="ignore"):
+        return angle, float(np.linalg.norm(np.array(pose[4:]) - expected.translation))

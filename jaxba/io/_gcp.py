@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
-from jaxba.io._list_cells import no_photos, number_or_nan, read_if_known, read_number, split_image
+from jaxba.io._list_cells import no_photos, number_or_nan, read_height, read_if_known, read_number, split_image
 from jaxba.io._list_text import (
     PLACE_COLUMNS,
     Line,
@@ -151,7 +151,7 @@ def _read_list(content: list[Line], name: str, is_photo: Callable[[str], bool]) 
         is_cell = rest.lstrip(" ").startswith("\t")  # else a blank ends the point's name
         given = rest.strip().split("\t")[0].strip() if is_cell else split_image(rest.strip(), no_photos)[0]
         mark = Mark(image=image, x_px=px, y_px=py, source=where)
-        rows.append(_row(given, where, crs, x, y, read_if_known(cells[2], where, "z"), mark))
+        rows.append(_row(given, where, crs, x, y, read_height(cells[2], where), mark))
     return rows
 
 
@@ -192,7 +192,7 @@ def _read_csv(table: Table, name: str) -> tuple[list[_Row], list[str]]:
             raise JaxbaError(f"{where}: image '' is empty; write the photo's name, or delete the line.")
         mark = Mark(image=cell("image"), x_px=px, y_px=py, source=where)
         stds = [_sigma(cell, column, where) or _sigma(cell, "std", where) for column in ("std_h", "std_v")]
-        z_m = read_if_known(cell("z"), where, "z")
+        z_m = read_height(cell("z"), where)
         rows.append(_row(cell("name"), where, known[text], x, y, z_m, mark, *stds, role=_role(cell, where)))
     return rows, notes
 

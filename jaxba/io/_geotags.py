@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from jaxba._errors import JaxbaError
-from jaxba.io._list_cells import no_photos, read_if_known, read_number, split_image, without_fillers
+from jaxba.io._list_cells import no_photos, read_height, read_if_known, read_number, split_image, without_fillers
 from jaxba.io._list_text import (
     PLACE_COLUMNS,
     Line,
@@ -142,10 +142,11 @@ def _read_geo(content: list[Line], name: str, is_photo: Callable[[str], bool]) -
                 f"{where}: has {count} columns; give 3 (image x y), 4 (and z), 7 (and yaw pitch roll) or 9 (and "
                 "horizontal and vertical accuracy)."
             )
-        names = ("z", "yaw", "pitch", "roll", "horizontal accuracy", "vertical accuracy")
-        numbers = [read_if_known(cell, where, label) for cell, label in zip(cells[2:], names, strict=False)]
-        numbers += [None] * (6 - len(numbers))
-        entries.append(_entry(image, line, where, crs, kind, x, y, numbers[0], numbers[1:4], numbers[4:6]))
+        z_m = read_height(cells[2], where) if count > 3 else None
+        names = ("yaw", "pitch", "roll", "horizontal accuracy", "vertical accuracy")
+        numbers = [read_if_known(cell, where, label) for cell, label in zip(cells[3:], names, strict=False)]
+        numbers += [None] * (5 - len(numbers))
+        entries.append(_entry(image, line, where, crs, kind, x, y, z_m, numbers[:3], numbers[3:]))
     return entries
 
 
@@ -189,8 +190,8 @@ def _read_csv(table: Table, name: str) -> tuple[list[Geotag], list[str]]:
             continue
         if not cell("name") or x is None or y is None:
             raise JaxbaError(f"{where}: name or position is empty; fill it in, or delete the line.")
-        z_m = value("z")
-        if z_m is None and (z_m := value("ellipsoidal")) is not None:
+        z_m = read_height(cell("z"), where)
+        if z_m is None and (z_m := read_height(cell("ellipsoidal"), where)) is not None:
             kind = "ellipsoidal"
         angles = [value("yaw"), value("pitch"), value("roll")]
         accuracies = [value("std_h") or value("std"), value("std_v") or value("std")]

@@ -20,24 +20,37 @@ HEIGHTS = (-2000.0, 100_000.0)
 FILLERS = (0.0, -99.0, -999.0, 999.0, 9999.0, 99999.0)
 """Numbers in that range that stand for no height where no other height is near."""
 _FAR, _NEAR, _SPREADS = 10.0, 1.0, 3.0
+_LARGEST = 1e12
 
 _IMAGE = re.compile(r"\.(jpe?g|jpe|jp2|tiff?|png|bmp|webp|dng|heic|heif|arw|cr2|cr3|nef|raf|rw2|orf)$", re.IGNORECASE)
 _QUOTED = re.compile(r"""(["'])(.+?)\1(?=\s|$)""")
 
 
 def read_number(text: str, where: str, label: str) -> float:
-    """Return a finite number."""
+    """Return a finite number, of a size that places, pixels, angles and sigmas can have."""
+    value = _finite(text, where, label)
+    if abs(value) > _LARGEST:
+        raise JaxbaError(f"{where}: {label} '{text}' is too large for a place, a pixel or a sigma; correct it.")
+    return value
+
+
+def read_if_known(text: str, where: str, label: str) -> float | None:
+    """Return such a number; None where the text is empty or a word such as NaN."""
+    return None if text.strip().lower() in NOT_KNOWN else read_number(text, where, label)
+
+
+def read_height(text: str, where: str) -> float | None:
+    """Return a finite number, which `without_fillers` judges; None where the text is empty or a word such as NaN."""
+    return None if text.strip().lower() in NOT_KNOWN else _finite(text, where, "z")
+
+
+def _finite(text: str, where: str, label: str) -> float:
     value = number_or_nan(text)
     if not math.isfinite(value):
         raise JaxbaError(
             f"{where}: {label} '{text}' is no number; write it with a point, without unit or thousands marks."
         )
     return value
-
-
-def read_if_known(text: str, where: str, label: str) -> float | None:
-    """Return a finite number; None where the text is empty or a word such as NaN."""
-    return None if text.strip().lower() in NOT_KNOWN else read_number(text, where, label)
 
 
 def number_or_nan(text: str) -> float:

@@ -69,7 +69,10 @@ def read_ply(path: str | os.PathLike[str]) -> CloudFile:
         raise JaxbaError(f"{label}: does not begin as a binary PLY of jaxba does; {_CURE}.")
     lines = header.decode("ascii", "replace").splitlines()
     properties = [line.split()[1:] for line in lines if line.startswith("property ")]
-    _expect_columns(label, [words[-1] for words in properties], VERTEX.names or ())
+    odd = next((words for words in properties if len(words) != 2), None)
+    if odd is not None:
+        raise JaxbaError(f"{label}: property '{' '.join(odd)}' is no type and name; {_CURE}.")
+    _expect_columns(label, [name for _, name in properties], VERTEX.names or ())
     for kind, name in properties:
         expected = PLY_TYPES[VERTEX[name].str]
         if kind != expected:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.io._colmap_lines import Damage, claim, content_lines, finite
+from jaxba.io._colmap_lines import Damage, claim, content_lines, finite, unit
 from jaxba.io._colmap_rigs import refuse_other_poses
 from jaxba.scene import Block
 
@@ -85,11 +85,10 @@ def read_colmap_text(folder: str | os.PathLike[str]) -> ColmapModel:
     row_of_camera = {camera_id: row for row, camera_id in enumerate(camera_ids)}
     _refuse_contradictions(images, points)
     seen = [[k for k, point_id in enumerate(image.point_ids) if point_id != _NO_POINT] for image in images]
-    pose = np.array([image.pose for image in images])
     block = Block(
         image_index=np.array([image.image_id for image in images], dtype=np.int64) - 1,
-        quaternion=pose[:, :4] / np.linalg.norm(pose[:, :4], axis=1, keepdims=True),
-        translation_m=pose[:, 4:],
+        quaternion=np.array([unit(image.pose[:4]) for image in images]),
+        translation_m=np.array([image.pose[4:] for image in images]),
         camera_model=model,
         camera_names=tuple(str(camera_id) for camera_id in camera_ids),
         camera_parameters=parameters,

@@ -128,7 +128,7 @@ stems = (
 
 
 @given(stems, st.sampled_from(["NFC", "NFD"]), st.sampled_from(["NFC", "NFD"]), st.sampled_from(" \t"), st.booleans())
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_a_name_in_either_unicode_form_is_found_between_blanks_or_tabs(
     stem: str, on_disk: str, in_list: str, separator: str, is_quoted: bool
 ):
@@ -140,6 +140,14 @@ def test_a_name_in_either_unicode_form_is_found_between_blanks_or_tabs(
     text = f"EPSG:32615\n{separator.join(['1', '2', '3', '4', '5', written, 'gcp01'])}"
     (point,) = parse_control(text, is_photo=photo_names([photo])).points
     assert point.name == "gcp01" and photo_finder([photo])(point.marks[0].image, "line 2") == photo
+
+
+@pytest.mark.parametrize("x", ["1e13", "-1e308", "1_000", "1,5", "1e400"])
+def test_a_number_that_is_no_coordinate_is_refused_by_line(x: str):
+    with pytest.raises(JaxbaError, match=r"geo\.txt line 2: x '.*' is (too large|no number)"):
+        parse_geotags(f"EPSG:32615\na.jpg {x} 2 3")
+    with pytest.raises(JaxbaError, match=r"gcp_list\.txt line 2: x '.*' is (too large|no number)"):
+        parse_control(f"EPSG:32615\n{x} 2 3 4 5 a.jpg")
 
 
 def test_a_label_without_an_ending_is_the_photo_of_that_name_and_with_one_no_other():

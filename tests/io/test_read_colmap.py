@@ -206,6 +206,11 @@ def test_numbers_and_ids_that_contradict_each_other_are_refused_by_line(
         read_colmap_text(tmp_path)
 
 
+def test_a_quaternion_of_any_length_is_one_of_unit_length(tmp_path: Path):
+    write_two(tmp_path, images=TWO_IMAGES.replace("1 1 0 0 0", "1 3e300 0 0 4e300").replace("2 1 0", "2 5e-320 0"))
+    assert poses(tmp_path)["a.jpg"][:4] == [0.6, 0, 0, 0.8] and poses(tmp_path)["b.jpg"][:4] == [1, 0, 0, 0]
+
+
 RIGS = "# rigs\n1 2 CAMERA 1 CAMERA 2 1 0.6 0 0 0.8 -1 0 5\n"
 FRAMES = "1 1 1 0 0 0 0 0 5 2 CAMERA 1 1 CAMERA 2 2\n"
 RIGGED = {

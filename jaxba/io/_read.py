@@ -33,7 +33,7 @@ def text_of(data: bytes, errors: str = "strict") -> str:
     Raises:
         UnicodeDecodeError: with `errors` at `strict`, the bytes are no such text.
 
-    >>> text_of(b"\xef\xbb\xbfa"), text_of("b".encode("utf-16"))
+    >>> text_of("a".encode("utf-8-sig")), text_of("b".encode("utf-16"))
     ('a', 'b')
     """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):

@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def measure(photos: Path, detector: str, workers: int) -> dict[str, Any]:
     """Return the figures of a run with one detector; a run that cannot end has the reason in their place."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "jaxba", "run", str(photos), "--out", f"{folder}/project"]
+        command = [sys.executable, "-m", "jaxba", "run", str(photos), "--gcp", "none", "--out", f"{folder}/project"]
         command += ["--workers", str(workers), "--set", f"features.detector={detector}"]
         subprocess.run([*command, "--stage", "pairs"], cwd=ROOT, capture_output=True, check=True)
         begun, cpu_begun = time.perf_counter(), _cpu_s()
@@ -60,7 +60,7 @@ def measure(photos: Path, detector: str, workers: int) -> dict[str, Any]:
 def decision(photos: Path) -> str:
     """Return what `auto` takes for a set, and why."""
     with tempfile.TemporaryDirectory() as folder:
-        run = run_pipeline(photos, Path(folder) / "project", PIPELINE.settings, until="pairs")
+        run = run_pipeline(photos, Path(folder) / "project", PIPELINE.settings, until="pairs", gcp=Path("none"))
         return " ".join(run.done.routing.reasons)
 
 

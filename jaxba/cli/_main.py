@@ -120,9 +120,13 @@ def run(
     set_: _Set = (),
     focal: Annotated[float | None, Parameter(help="Focal length in pixels, in place of the tags'.")] = None,
     geotags: Annotated[
-        Path | None, Parameter(help="A geo.txt or CSV in place of the tags. [default: geo.txt among the photos]")
+        Path | None,
+        Parameter(help="A geo.txt or CSV in place of the tags, or none. [default: geo.txt among the photos]"),
     ] = None,
-    gcp: Annotated[Path | None, Parameter(help="Control points: a gcp_list.txt or CSV.")] = None,
+    gcp: Annotated[
+        Path | None,
+        Parameter(help="Control points: a gcp_list.txt or CSV, or none. [default: gcp_list.txt among the photos]"),
+    ] = None,
     check: Annotated[Path | None, Parameter(help="Check points, in the same form: only compared.")] = None,
     require_connected: Annotated[
         bool, Parameter(negative="", show_default=False, help="Stop where the photos fall into several groups.")

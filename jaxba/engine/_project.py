@@ -21,13 +21,15 @@ from typing import Any
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._store import sha256
-from jaxba.io import cannot_write, remove_leftovers, write_atomically
+from jaxba.io import cannot_write, remove_leftovers, text_of, write_atomically
 from jaxba.scene import PhotoFile
 
 SETTINGS, SUMMARY = "jaxba.toml", "summary.json"
 _RUN, _PHOTOS = "run.json", "photos.json"
-_GEOTAGS = "geo.txt"
+FOUND_LISTS = {"geotags": "geo.txt", "gcp": "gcp_list.txt"}
+"""Names, in any case, of the lists that are used where they lie among the photos and no other is given."""
 _LISTS = ("geotags", "gcp", "check")
+_NO_LIST = Path("none")
 _LONGEST_NAME = 180  # bytes of a folder's name, which mostly may have 255
 
 
@@ -35,7 +37,8 @@ _LONGEST_NAME = 180  # bytes of a folder's name, which mostly may have 255
 class Given:
     """What a run was given beside its parameters: the folder of photos, and lists.
 
-    - `geotags`: replaces the photos' tags. `gcp`, `check`: surveyed points and their marks.
+    - `geotags`: replaces the photos' tags. `gcp`, `check`: surveyed points and their marks. `none` stands for no list,
+      not even one that lies among the photos.
     """
 
     photos: Path
@@ -82,7 +85,10 @@ class Project:
 
     def write_given(self, given: Given, stage: str | None) -> None:
         """Write what a run was given and the stage that it is in; None: it has ended."""
-        paths = {name: None if path is None else str(path.absolute()) for name, path in vars(given).items()}
+        paths = {
+            name: path if path is None else str(path if path == _NO_LIST else path.absolute())
+            for name, path in vars(given).items()
+        }
         self.write_json(_RUN, {**paths, "stage": stage})
 
     def read_given(self) -> tuple[Given, str | None]:
@@ -147,25 +153,43 @@ def refuse_photo_folder(photos: Path, out: Path) -> None:
 
 
 def read_lists(given: Given) -> dict[str, Any]:
-    """Return name and text of the lists, as `Done` takes them; `geo.txt` among the photos is one of tags."""
-    geotags = given.geotags
-    if geotags is None and (given.photos / _GEOTAGS).is_file():
-        geotags = given.photos / _GEOTAGS
+    """Return name and text of the lists, as `Done` takes them, and which of them lie among the photos.
+
+    Raises `JaxbaError` where a list cannot be read, and where two files among the photos are called like one.
+    """
+    paths = {name: getattr(given, name) for name in _LISTS}
+    for name, usual in FOUND_LISTS.items():
+        if paths[name] is None:
+            paths[name] = _among(given.photos, usual)
+    folder = given.photos.resolve()
+    used = [path.resolve() for path in paths.values() if path is not None and path != _NO_LIST]
     return {
-        "geotags": _read_list(geotags, "a geo.txt or CSV"),
-        "gcp": _read_list(given.gcp, "a gcp_list.txt or CSV"),
-        "check": _read_list(given.check, "a gcp_list.txt or CSV"),
+        "geotags": _read_list(paths["geotags"], "a geo.txt or CSV"),
+        "gcp": _read_list(paths["gcp"], "a gcp_list.txt or CSV"),
+        "check": _read_list(paths["check"], "a gcp_list.txt or CSV"),
+        "found_lists": tuple(name for name, path in paths.items() if path is not None and getattr(given, name) is None),
+        "own_lists": tuple(path.relative_to(folder).as_posix() for path in used if path.is_relative_to(folder)),
     }
+
+
+def _among(photos: Path, usual: str) -> Path | None:
+    """Return the file in the folder of photos that has the usual name of a list, in any case."""
+    if not photos.is_dir():
+        return None
+    found = sorted(path for path in photos.iterdir() if path.name.lower() == usual and path.is_file())
+    if len(found) > 1:
+        raise JaxbaError(f"{photos}: holds {' and '.join(path.name for path in found)}; keep one of them.")
+    return found[0] if found else None
 
 
 def _read_list(path: Path | None, kind: str) -> tuple[str, str] | None:
     """Return name and text of a list; None where none is given. `kind`: what it is to be, for messages."""
-    if path is None:
+    if path is None or path == _NO_LIST:
         return None
     if not path.is_file():
         raise JaxbaError(f"{path}: there is no such file; give {kind}.")
     try:
-        return str(path.name), path.read_text(encoding="utf-8-sig")
+        return str(path.name), text_of(path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
         raise JaxbaError(f"{path}: cannot be read as text ({error}); give {kind} in UTF-8.") from error
 

@@ -20,6 +20,7 @@ from typing import Any
 from jaxba._errors import JaxbaError
 from jaxba.engine._key import plain
 from jaxba.engine._parameters import Parameters, allowed, taken
+from jaxba.io import text_of
 
 Settings = Mapping[str, Parameters]
 """Parameters by section."""
@@ -45,7 +46,7 @@ def changed(settings: Settings, changes: Sequence[str]) -> dict[str, Parameters]
 def from_toml(path: Path, settings: Settings) -> dict[str, Parameters]:
     """Return the settings with those of a TOML file."""
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        tables = tomllib.loads(text_of(path.read_bytes()))
     except FileNotFoundError:
         raise JaxbaError(f"{path}: there is no such file; `jaxba config` prints one to begin with.") from None
     except (OSError, UnicodeDecodeError) as error:

@@ -23,15 +23,23 @@ from ._gcp import (
     ControlList as ControlList,
     Mark as Mark,
     SurveyedPoint as SurveyedPoint,
+    is_check_label as is_check_label,
     parse_control as parse_control,
 )
 from ._geopackage import write_geojson as write_geojson, write_geopackage as write_geopackage
-from ._geotag_match import match_geotags as match_geotags, photo_finder as photo_finder
+from ._geotag_match import (
+    like_photo as like_photo,
+    match_geotags as match_geotags,
+    photo_finder as photo_finder,
+    photo_names as photo_names,
+)
 from ._geotags import Geotag as Geotag, Geotags as Geotags, parse_geotags as parse_geotags
 from ._las import write_las as write_las
+from ._list_cells import without_fillers as without_fillers
 from ._opensfm import write_opensfm as write_opensfm
 from ._ply import write_ply as write_ply
 from ._problem import read_problem as read_problem
+from ._read import text_of as text_of
 from ._read_colmap import ColmapModel as ColmapModel, read_colmap_text as read_colmap_text
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
 from ._sites import Sites as Sites, make_sites as make_sites

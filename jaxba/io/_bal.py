@@ -24,10 +24,11 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem
 from jaxba.geometry import BAL, Pose
 from jaxba.io._atomic import write_atomically
-from jaxba.io._read import read_bytes
+from jaxba.io._read import read_bytes, text_of
 
 _BZ2_MAGIC = b"BZh"
 _D = np.array([1.0, -1.0, -1.0])
+_LONGEST_ROTATION = 1e15  # radians: beyond it neighbours in float64 are a radian apart
 _AGAIN = "copy or download it again"
 
 
@@ -50,12 +51,20 @@ def read_bal(path: str | os.PathLike[str]) -> Problem:
             data = bz2.decompress(data)
         except (OSError, ValueError, EOFError) as error:
             raise JaxbaError(f"{label}: damaged or truncated bz2 ({error}); {_AGAIN}.") from error
+    data = text_of(data, "replace").encode()  # without a byte order mark
     values = _numbers(data, label)
     num_images, num_points, num_observations = _counts(values, data, label)
     end_observations = 3 + 4 * num_observations
     end_cameras = end_observations + 9 * num_images
     rows = values[3:end_observations].reshape(-1, 4)
     cameras = values[end_observations:end_cameras].reshape(-1, 9)
+    far = np.flatnonzero(np.abs(cameras[:, :3]).max(axis=1) > _LONGEST_ROTATION)
+    if far.size:
+        line = _line(data, end_observations + 9 * int(far[0]))
+        raise JaxbaError(
+            f"{label}, line {line}: camera {far[0]} is turned by {np.abs(cameras[far[0], :3]).max():g} radians, which "
+            "have no digits left to say where it looks; correct the line."
+        )
     image_index = _indices(rows, 0, num_images, "camera", data, label)
     point_index = _indices(rows, 1, num_points, "point", data, label)
     return Problem.build(

@@ -93,7 +93,8 @@ def _check_values(array: np.ndarray, spec: ArraySpec, known: Mapping[str | int, 
                 f"{known[spec.indexes] - 1}; correct it ({bad.size} of {array.size} are out of range)."
             )
     if spec.unit_norm:
-        norm = np.linalg.norm(array, axis=-1)
+        with np.errstate(over="ignore"):
+            norm = np.linalg.norm(array, axis=-1)
         bad = np.flatnonzero(~(np.abs(norm - 1) <= _UNIT_NORM_TOLERANCE))
         if bad.size:
             raise JaxbaError(

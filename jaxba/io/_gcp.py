@@ -6,7 +6,8 @@ gcp_list.txt, a line a mark, by blanks or tabs; all after `image` may be missing
     x y z px py image [name] [anything]
 
 x is the easting or longitude whatever the CRS's own axis order. px and py count from the outer corner of the first
-pixel. Points without a name are told apart by their coordinates, and named point1, point2, ... in their order.
+pixel. Points without a name are told apart by their coordinates, and named point1, point2, ... in their order. z may be
+NaN, OpenDroneMap's word for no height, and a name that begins with `CHK-` is that of a check point, as it is there.
 
 CSV: columns by name in any order: `name`, `x`, `y`, `z`, `px`, `py`, `image` and common variants; sigmas of the
 coordinates in metres as `std_h`, `std_v`; `role`, control or check. The CRS stands in a `crs` column or a comment such
@@ -15,20 +16,21 @@ as `# EPSG:32615` on the first line; latitude and longitude are EPSG:4326 withou
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
+from jaxba.io._list_cells import no_photos, number_or_nan, read_height, read_if_known, read_number, split_image
 from jaxba.io._list_text import (
     PLACE_COLUMNS,
     Line,
+    Table,
     columns_by_name,
     content_lines,
-    crs_of_comment,
     csv_rows,
-    header_titles,
+    find_table,
     read_crs,
-    read_number,
     refuse_degrees_out_of_range,
 )
 
@@ -41,6 +43,7 @@ _COLUMNS = {
     "role": ("role", "type", "kind", "usage"),
 }
 _CHECK, _CONTROL = ("check", "checkpoint", "check_point", "cp", "ckp"), ("control", "gcp", "control_point", "")
+_CHECK_LABEL = re.compile(r"CHK[-_ ]", re.IGNORECASE)
 _PLACE = ("crs", "x", "y", "z_m", "std_h_m", "std_v_m", "is_check")
 
 
@@ -62,8 +65,8 @@ class SurveyedPoint:
     """A point of a list, with all its marks.
 
     - `crs`, `x`, `y`: east or longitude first. `z_m`: in the list's own unit and height system; None where it has none.
-    - `std_h_m`, `std_v_m`: None where the list states none. `is_check`: its role says so. `source`: file and line.
-    - `is_named`: by the list; else it was given a number.
+    - `std_h_m`, `std_v_m`: None where the list states none. `is_check`: its role or name says so.
+    - `source`: file and line. `is_named`: by the list; else it was given a number.
     """
 
     name: str
@@ -95,10 +98,25 @@ class _Row:
     point: SurveyedPoint
 
 
-def parse_control(text: str, name: str = "gcp_list.txt", unnamed: str = "point") -> ControlList:
+def is_check_label(name: str) -> bool:
+    """Whether a point's name says that it is a check point, by OpenDroneMap's convention.
+
+    >>> is_check_label("CHK-1"), is_check_label("chk_07"), is_check_label("gcp01")
+    (True, True, False)
+    """
+    return _CHECK_LABEL.match(name) is not None
+
+
+def parse_control(
+    text: str,
+    name: str = "gcp_list.txt",
+    unnamed: str = "point",
+    is_photo: Callable[[str], bool] = no_photos,
+) -> ControlList:
     """Return the points of a gcp_list.txt or CSV, each with its marks.
 
     - `name`: of the file, for messages. `unnamed`: what points without a name are called, with a number.
+    - `is_photo`: tells the names of photos, which may have blanks in them.
 
     Raises `JaxbaError` with file, line, field and value for what cannot be read, for a name with two places, and for a
     point that is marked twice in one photo.
@@ -107,82 +125,91 @@ def parse_control(text: str, name: str = "gcp_list.txt", unnamed: str = "point")
     >>> [(point.name, len(point.marks)) for point in parse_control(text).points]
     [('point1', 2)]
     """
-    content, comment = content_lines(text)
+    content, comments = content_lines(text)
     if not content:
         raise JaxbaError(f"{name}: is empty; give a CRS line and a line a mark, or a CSV with a header line.")
-    header = header_titles(content[0][1], (*_COLUMNS["image"], *_COLUMNS["px"]))
-    notes: list[str] = []
-    if header is not None:
-        rows, notes = _read_csv(content, header, crs_of_comment(comment), name)
-    else:
-        rows = _read_list(content, name)
+    table = find_table(content, comments, _COLUMNS)
+    rows, notes = (_read_list(content, name, is_photo), []) if table is None else _read_csv(table, name)
     if not rows:
         raise JaxbaError(f"{name}: lists no mark; give a line a mark below the first, or leave the list away.")
     return ControlList(points=_points(rows, unnamed), notes=tuple(notes))
 
 
-def _read_list(content: list[Line], name: str) -> list[_Row]:
+def _read_list(content: list[Line], name: str, is_photo: Callable[[str], bool]) -> list[_Row]:
     crs, _ = read_crs(content[0][1], f"{name} line {content[0][0]}", "gcp_list.txt")
     rows = []
     for line, words in content[1:]:
         where = f"{name} line {line}"
-        cells = [cell.strip() for cell in words.split("\t")] if words.count("\t") >= 5 else words.split()
+        cells = _cells(words)
         if len(cells) < 6:
-            raise JaxbaError(f"{where}: '{words}' has {len(cells)} columns; give x y z px py image, then a name.")
-        x, y, z_m, px, py = (
-            read_number(cell, where, label) for cell, label in zip(cells, ("x", "y", "z", "px", "py"), strict=False)
-        )
-        given = cells[6] if len(cells) > 6 else ""
-        rows.append(_row(given, where, crs, x, y, z_m, Mark(image=cells[5], x_px=px, y_px=py, source=where)))
+            commas = " Separate columns by blanks, or name them in a header line." if words.count(",") >= 5 else ""
+            raise JaxbaError(
+                f"{where}: '{words}' has {len(cells)} columns; give x y z px py image, then a name.{commas}"
+            )
+        x, y, px, py = (read_number(cells[k], where, label) for k, label in ((0, "x"), (1, "y"), (3, "px"), (4, "py")))
+        image, rest = split_image(cells[5], is_photo)
+        is_cell = rest.lstrip(" ").startswith("\t")  # else a blank ends the point's name
+        given = rest.strip().split("\t")[0].strip() if is_cell else split_image(rest.strip(), no_photos)[0]
+        mark = Mark(image=image, x_px=px, y_px=py, source=where)
+        rows.append(_row(given, where, crs, x, y, read_height(cells[2], where), mark))
     return rows
 
 
-def _read_csv(
-    content: list[Line], header: list[str], comment_crs: str | None, name: str
-) -> tuple[list[_Row], list[str]]:
-    place, unused = columns_by_name(header, _COLUMNS)
+def _cells(words: str) -> list[str]:
+    """Return x, y, z, px, py and all that follows; between tabs z may be empty."""
+    cells = words.split(maxsplit=5)
+    by_tab = [cell.strip() for cell in words.split("\t", maxsplit=5)]
+    is_short = len(cells) < 6 or number_or_nan(cells[4]) != number_or_nan(cells[4])
+    return by_tab if is_short and len(by_tab) == 6 and not by_tab[2] else cells
+
+
+def _read_csv(table: Table, name: str) -> tuple[list[_Row], list[str]]:
+    place, unused = columns_by_name(table.header, _COLUMNS)
     notes = [f"{name}: columns that are not used: {', '.join(unused)}."] if any(unused) else []
     is_geographic = "latitude" in place and "longitude" in place
     x_name, y_name = ("longitude", "latitude") if is_geographic else ("x", "y")
     missing = [column for column in (x_name, y_name, "px", "py", "image") if column not in place]
     if missing:
-        raise JaxbaError(
-            f"{name} line {content[0][0]}: columns {', '.join(header)} lack {', '.join(missing)}; name them x, y (or "
-            "longitude, latitude), z, px, py, image, name."
+        alone = (
+            "" if set(missing) != {"px", "py", "image"} else " Coordinates alone do not say where photos show a point."
         )
-    if not is_geographic and "crs" not in place and comment_crs is None:
+        raise JaxbaError(
+            f"{name} line {table.line}: columns {', '.join(table.header)} lack {', '.join(missing)}; name them x, y "
+            "(or longitude, latitude), z, px, py, image, name, and give a line for each photo that shows a point."
+            f"{alone}"
+        )
+    if not is_geographic and "crs" not in place and table.crs is None:
         raise JaxbaError(f"{name}: x and y need a CRS; add a crs column, or a first line such as '# EPSG:32615'.")
     known: dict[str, str] = {}
     rows = []
-    for line, cell in csv_rows(content[1:], header, place, name):
+    for line, cell in csv_rows(table, place, name):
         where = f"{name} line {line}"
-        text = cell("crs") or comment_crs or ("EPSG:4326" if is_geographic else "")
+        text = cell("crs") or table.crs or ("EPSG:4326" if is_geographic else "")
         if text not in known:
             known[text] = read_crs(text, where, "gcp_list.txt")[0]
         x, y, px, py = (read_number(cell(column), where, column) for column in (x_name, y_name, "px", "py"))
         if not cell("image"):
             raise JaxbaError(f"{where}: image '' is empty; write the photo's name, or delete the line.")
         mark = Mark(image=cell("image"), x_px=px, y_px=py, source=where)
-        stds = [_sigma(cell, column, where) for column in ("std_h", "std_v")]
-        z_m = read_number(cell("z"), where, "z") if cell("z") else None
-        rows.append(_row(cell("name"), where, known[text], x, y, z_m, mark, *stds, is_check=_is_check(cell, where)))
+        stds = [_sigma(cell, column, where) or _sigma(cell, "std", where) for column in ("std_h", "std_v")]
+        z_m = read_height(cell("z"), where)
+        rows.append(_row(cell("name"), where, known[text], x, y, z_m, mark, *stds, role=_role(cell, where)))
     return rows, notes
 
 
 def _sigma(cell: Callable[[str], str], column: str, where: str) -> float | None:
-    if not cell(column):
-        return None
-    value = read_number(cell(column), where, column)
+    value = read_if_known(cell(column), where, column) or 0.0
     if value < 0:
         raise JaxbaError(f"{where}: {column} {value:g} is negative; give a sigma in metres, 0 if unknown.")
     return value or None
 
 
-def _is_check(cell: Callable[[str], str], where: str) -> bool:
+def _role(cell: Callable[[str], str], where: str) -> str:
+    """Return `check` or `control`; empty where the list leaves it to the point's name."""
     role = cell("role").lower().replace(" ", "_").replace("-", "_")
     if role not in (*_CHECK, *_CONTROL):
         raise JaxbaError(f"{where}: role '{cell('role')}' is not known; write control or check.")
-    return role in _CHECK
+    return "check" if role in _CHECK else role and "control"
 
 
 def _row(
@@ -196,12 +223,12 @@ def _row(
     std_h_m: float | None = None,
     std_v_m: float | None = None,
     *,
-    is_check: bool = False,
+    role: str = "",
 ) -> _Row:
     refuse_degrees_out_of_range(crs, x, y, where)
     point = SurveyedPoint(
-        name=name, crs=crs, x=x, y=y, z_m=z_m, marks=(mark,), std_h_m=std_h_m, std_v_m=std_v_m, is_check=is_check,
-        source=where,
+        name=name, crs=crs, x=x, y=y, z_m=z_m, marks=(mark,), std_h_m=std_h_m, std_v_m=std_v_m, source=where,
+        is_check=is_check_label(name) if not role else role == "check",
     )  # fmt: skip
     return _Row(name=name, point=point)
 
@@ -221,8 +248,9 @@ def _points(rows: list[_Row], unnamed: str) -> tuple[SurveyedPoint, ...]:
         before = first.setdefault(name, row.point)
         for field, old, new in zip(_PLACE, _place(before), _place(row.point), strict=True):
             if old != new:
+                one, two = ("none" if value is None else value for value in (old, new))
                 raise JaxbaError(
-                    f"{row.point.source}: {name} has {field} {new}, and {old} in {before.source}; give one value, or "
+                    f"{row.point.source}: {name} has {field} {two}, and {one} in {before.source}; give one value, or "
                     "two names."
                 )
         same = marks.setdefault(name, {}).get(mark.image)

@@ -1,5 +1,6 @@
-"""The bytes of an input file, or an error that says why there are none."""
+"""The bytes and the text of an input file, or an error that says why there are none."""
 
+import codecs
 import os
 
 from jaxba._errors import JaxbaError
@@ -24,3 +25,17 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     if not data:
         raise JaxbaError(f"{label}: is empty; write or copy it again.")
     return data
+
+
+def text_of(data: bytes, errors: str = "strict") -> str:
+    """Return the text of a file in UTF-8, or in UTF-16 where its byte order mark says so, without that mark.
+
+    Raises:
+        UnicodeDecodeError: with `errors` at `strict`, the bytes are no such text.
+
+    >>> text_of("a".encode("utf-8-sig")), text_of("b".encode("utf-16"))
+    ('a', 'b')
+    """
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", errors)
+    return data.decode("utf-8-sig", errors)

@@ -15,7 +15,7 @@ from jaxba._errors import JaxbaError
 from jaxba.io._cloud import Cloud
 from jaxba.io._csv_cloud import COLUMNS
 from jaxba.io._ply import PLY_TYPES, VERTEX
-from jaxba.io._read import read_bytes
+from jaxba.io._read import read_bytes, text_of
 
 _FORMAT = b"ply\nformat binary_little_endian 1.0\n"
 _END = b"end_header\n"
@@ -40,7 +40,7 @@ def read_csv_cloud(path: str | os.PathLike[str]) -> CloudFile:
         JaxbaError: a column is missing or not known, a row is damaged, or rows have codes of several CRSs.
     """
     label = os.fspath(path)
-    lines = csv.reader(read_bytes(path).decode("utf-8", "replace").splitlines(), quoting=csv.QUOTE_NONE)
+    lines = csv.reader(text_of(read_bytes(path), "replace").splitlines(), quoting=csv.QUOTE_NONE)
     try:
         header, *cells = lines
     except csv.Error as error:
@@ -69,7 +69,10 @@ def read_ply(path: str | os.PathLike[str]) -> CloudFile:
         raise JaxbaError(f"{label}: does not begin as a binary PLY of jaxba does; {_CURE}.")
     lines = header.decode("ascii", "replace").splitlines()
     properties = [line.split()[1:] for line in lines if line.startswith("property ")]
-    _expect_columns(label, [words[-1] for words in properties], VERTEX.names or ())
+    odd = next((words for words in properties if len(words) != 2), None)
+    if odd is not None:
+        raise JaxbaError(f"{label}: property '{' '.join(odd)}' is no type and name; {_CURE}.")
+    _expect_columns(label, [name for _, name in properties], VERTEX.names or ())
     for kind, name in properties:
         expected = PLY_TYPES[VERTEX[name].str]
         if kind != expected:

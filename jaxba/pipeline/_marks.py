@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.io import Mark, SurveyedPoint, photo_finder
+from jaxba.io import Mark, SurveyedPoint, like_photo, photo_finder
 from jaxba.pipeline._mark_turn import TURNS, best_turn, on_stored_grid, shown_size
 from jaxba.scene import LeftOut, Photo
 
@@ -53,7 +53,8 @@ def marks_in_photos(
     Raises `JaxbaError` where no photo of the list is there, a point is marked twice in a photo, and where marks lie
     outside their photos and nothing tells the scale.
     """
-    find = photo_finder([photo.name for photo in photos])
+    names = [photo.name for photo in photos]
+    find = photo_finder(names)
     index = {photo.name: k for k, photo in enumerate(photos)}
     point, image, marks = [], [], []
     unknown: dict[str, list[str]] = {}
@@ -74,14 +75,18 @@ def marks_in_photos(
             image.append(index[found])
             marks.append(mark)
     if not marks:
+        said = [image + like_photo(image, names) for image in list(unknown)[:_SHOWN]]
         raise JaxbaError(
-            f"{name} marks none of the photos: it names {', '.join(list(unknown)[:_SHOWN])}, the folder holds "
-            f"{', '.join(photo.name for photo in photos[:_SHOWN])}; write the names as in the folder, or leave the "
-            "list away."
+            f"{name} marks none of the photos: it names {', '.join(said)}, the folder holds "
+            f"{', '.join(names[:_SHOWN])}; write the names as in the folder, or leave the list away."
         )
     left = [
-        LeftOut(name=photo, reason=f"is marked ({', '.join(names)}), but is none of the photos that can be used")
-        for photo, names in unknown.items()
+        LeftOut(
+            name=image,
+            reason=f"is marked ({', '.join(marked)}), but is none of the photos that can be used"
+            + like_photo(image, names),
+        )
+        for image, marked in unknown.items()
     ]
     xy_px = np.array([[mark.x_px, mark.y_px] for mark in marks])
     size_px = np.array([[photos[k].width_px, photos[k].height_px] for k in image], float)

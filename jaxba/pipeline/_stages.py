@@ -25,7 +25,10 @@ from jaxba.scene import LeftOut, PairRecord, Reference, ViewGraph
 
 def _metadata(done: Done) -> metadata.Inputs:
     name, text = done.geotags or ("geo.txt", None)
-    return metadata.Inputs(files=done.files, geotags=text, geotags_name=name)
+    return metadata.Inputs(
+        files=done.files, geotags=text, geotags_name=name, is_geotags_found="geotags" in done.found_lists,
+        own_lists=done.own_lists,
+    )  # fmt: skip
 
 
 def _crs(done: Done) -> crs.Inputs:
@@ -39,6 +42,7 @@ def _control(done: Done) -> control.Inputs:
         target_crs=made(done.crs).target_crs,
         gcp=done.gcp,
         check=done.check,
+        is_gcp_found="gcp" in done.found_lists,
     )
 
 

@@ -1,8 +1,9 @@
 """Stage control: surveyed points in the local frame, their marks in the photos, which are control and which check.
 
-A point is a check point if any of these says so: it stands in the check list, its role in a CSV is check, or the
-parameter `check` names it. All others are control points. A check point takes no part in anything but the comparison.
-A name may stand in both lists, with the same coordinates; it is a check point then, with the marks of both.
+A point is a check point if any of these says so: it stands in the check list, its role in a CSV is check, its name
+begins with CHK- and no role says otherwise, or the parameter `check` names it. All others are control points. A check
+point takes no part in anything but the comparison. A name may stand in both lists, with the same coordinates; it is a
+check point then, with the marks of both.
 
 Where no photo has a position, the control points place the local frame, and their CRS is that of the results unless
 another is given. Without a list the reference passes through.
@@ -15,10 +16,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
-from jaxba.io import ControlList, SurveyedPoint, parse_control
+from jaxba.engine._words import some
+from jaxba.io import ControlList, SurveyedPoint, is_check_label, parse_control, photo_names, without_fillers
 from jaxba.pipeline._mark_turn import expected_px
 from jaxba.pipeline._marks import marks_in_photos
 from jaxba.report import Told, control_facts, control_lines, reference_facts
@@ -32,7 +35,8 @@ _LEAST_FIT = {"helmert": 3, "affine": 4}  # control points that are marked twice
 class Inputs:
     """- `photos`, `reference`: of the stages before. `target_crs`: that was asked for.
 
-    - `gcp`, `check`: name and text of the lists; None where there is none.
+    - `gcp`, `check`: name and text of the lists; None where there is none. `is_gcp_found`: nobody named `gcp`, which
+      lies among the photos.
     """
 
     photos: tuple[Photo, ...]
@@ -40,6 +44,7 @@ class Inputs:
     target_crs: str | None = None
     gcp: tuple[str, str] | None = None
     check: tuple[str, str] | None = None
+    is_gcp_found: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +103,21 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     """
     if inputs.gcp is None and inputs.check is None:
         return Outputs(reference=inputs.reference, control=Control.nothing())
+    if inputs.gcp is None or not inputs.is_gcp_found:
+        return _placed(inputs, params)
+    name = inputs.gcp[0]
+    try:
+        made = _placed(inputs, params)
+    except JaxbaError as error:
+        raise JaxbaError(
+            f"{error} {name} was found among the photos: mend it, or go without it by --gcp none."
+        ) from error
+    found = f"{name} was found among the photos, and is used as control (--gcp names another list, or none)."
+    return dataclasses.replace(made, notes=(found, *made.notes))
+
+
+def _placed(inputs: Inputs, params: Params) -> Outputs:
+    """Return the points of the lists in the local frame."""
     from jaxba import geo  # loads pyproj
 
     names = " and ".join(entry[0] for entry in (inputs.gcp, inputs.check) if entry is not None)
@@ -112,7 +132,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         orientation=params.mark_orientation,
     )
     xyz = np.array([[point.x, point.y, np.nan if point.z_m is None else point.z_m] for point in points])
-    xyz[:, 2] = _heights(xyz[:, 2], params.heights, names, notes)
+    xyz[:, 2] = _heights(points, params.heights, names, notes)
     frame = inputs.reference.frame
     surveyed = geo.surveyed_points(
         [point.crs for point in points],
@@ -183,10 +203,11 @@ def _all_points(inputs: Inputs, params: Params) -> tuple[list[SurveyedPoint], li
     """Return the points of both lists, check points marked as such, and notes."""
     notes: list[str] = []
     found: dict[str, SurveyedPoint] = {}
+    is_photo = photo_names([photo.name for photo in inputs.photos])
     for entry, is_check in ((inputs.gcp, False), (inputs.check, True)):
         if entry is None:
             continue
-        read: ControlList = parse_control(entry[1], entry[0], "check" if is_check else "point")
+        read: ControlList = parse_control(entry[1], entry[0], "check" if is_check else "point", is_photo)
         notes += read.notes
         for point in read.points:
             same = found.get(point.name) if point.is_named else None
@@ -201,9 +222,22 @@ def _all_points(inputs: Inputs, params: Params) -> tuple[list[SurveyedPoint], li
         raise JaxbaError(
             f"control.check={params.check}: no point is called {', '.join(unknown)}; the points are {', '.join(found)}."
         )
-    return [
-        dataclasses.replace(point, is_check=point.is_check or name in asked) for name, point in found.items()
-    ], notes
+    points = [dataclasses.replace(point, is_check=point.is_check or name in asked) for name, point in found.items()]
+    return points, [*notes, *_label_notes(points)]
+
+
+def _label_notes(points: Sequence[SurveyedPoint]) -> list[str]:
+    """Return notes on the points that are check points by their names, and on those that only look like some."""
+    by_label = [point.name for point in points if point.is_check and is_check_label(point.name)]
+    alike = [point.name for point in points if not point.is_check and point.name.lower().startswith(("chk", "check"))]
+    notes = []
+    if by_label:
+        notes.append(f"Check points by their names, CHK-...: {some(by_label)}.")
+    if alike:
+        notes.append(
+            f"{some(alike)}: used as control. If these are check points, name them CHK-... or give control.check."
+        )
+    return notes
 
 
 def _is_one_unnamed(first: SurveyedPoint, second: SurveyedPoint) -> bool:
@@ -226,22 +260,21 @@ def _joined(first: SurveyedPoint, second: SurveyedPoint) -> SurveyedPoint:
     return dataclasses.replace(first, marks=(*first.marks, *new), is_check=first.is_check or second.is_check)
 
 
-def _heights(z: np.ndarray, asked: str, names: str, notes: list[str]) -> np.ndarray:
+def _heights(points: Sequence[SurveyedPoint], asked: str, names: str, notes: list[str]) -> Float[np.ndarray, " points"]:
     """Return the heights that were measured, NaN for others."""
+    if asked == "ignore":
+        notes.append(f"{names}: heights are ignored as asked (control.heights=ignore): control is horizontal only.")
+        return np.full(len(points), np.nan)
+    measured, found = without_fillers(
+        [point.z_m for point in points], [point.name for point in points], names, kind="point",
+        so=": horizontal control only", cure=" If 0 was measured, set control.heights=use.", keep_zeros=asked == "use",
+    )  # fmt: skip
+    notes += found
+    z = np.array([np.nan if value is None else value for value in measured])
     known = np.isfinite(z)
     if not known.any():
         notes.append(f"{names} has no heights: control is horizontal only.")
-        return z
-    if asked == "ignore":
-        notes.append(f"{names}: heights are ignored as asked (control.heights=ignore): control is horizontal only.")
-        return np.full(len(z), np.nan)
-    if asked == "auto" and not z[known].any():
-        notes.append(
-            f"{names}: all heights are 0, as in a list without heights: they are taken as not measured, and control is "
-            "horizontal only. If all points do lie at height 0, set control.heights=use."
-        )
-        return np.full(len(z), np.nan)
-    if len(z) > 2 and known.all() and np.ptp(z) == 0:
+    elif len(z) > 2 and known.all() and np.ptp(z) == 0:
         notes.append(
             f"{names}: all {len(z)} heights are {z[0]:g}. They are used; if they were not measured, set "
             "control.heights=ignore."

@@ -1,10 +1,10 @@
 """Stage metadata: what each photo's tags and header tell; what cannot be used is left out and named.
 
 Photos are the files with an image's suffix that are no masks; RAW files are left out, and other files are counted. Of
-files with equal contents the first by name stays. A geo.txt or CSV replaces position, accuracy and, where it has angles,
-attitude of the photos that it lists; its heights are turned into metres by the unit of its CRS. The height above take-off
-stays that of the tags, and what else they say of the place is kept beside, for the list to be held against. No pixel is
-decoded here.
+files with equal contents the first by name stays. A geo.txt or CSV replaces position, accuracy and, where it has
+angles, attitude of the photos that it lists; its heights are turned into metres by the unit of its CRS. The height
+above take-off stays that of the tags, and what else they say of the place is kept beside, for the list to be held
+against. No pixel is decoded here.
 """
 
 import dataclasses
@@ -17,8 +17,9 @@ import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
+from jaxba.engine._project import FOUND_LISTS
 from jaxba.engine._words import many, some_photos
-from jaxba.io import Geotag, match_geotags, parse_geotags
+from jaxba.io import Geotag, match_geotags, parse_geotags, photo_names
 from jaxba.pipeline._masks import is_mask, with_masks
 from jaxba.report import Told, grouped, with_ranges
 from jaxba.scene import Attitude, LeftOut, Photo, PhotoFile
@@ -30,11 +31,16 @@ _MOST_NOTES = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """- `files`: the photo folder's files, by name. `geotags`: text of a geo.txt or CSV that replaces the tags."""
+    """- `files`: the photo folder's files, by name. `geotags`: text of a geo.txt or CSV that replaces the tags.
+
+    - `is_geotags_found`: nobody named that list, which lies among the photos. `own_lists`: files that are lists in use.
+    """
 
     files: tuple[PhotoFile, ...]
     geotags: str | None = None
     geotags_name: str = "geo.txt"
+    is_geotags_found: bool = False
+    own_lists: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +66,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     Raises:
         JaxbaError: no file is a photo, none can be used, or the list that replaces the tags cannot be read.
     """
-    geotags = None if inputs.geotags is None else parse_geotags(inputs.geotags, inputs.geotags_name)
     files = sorted(inputs.files, key=lambda file: file.name)
+    is_photo = photo_names([file.name for file in files])
+    geotags = None if inputs.geotags is None else parse_geotags(inputs.geotags, inputs.geotags_name, is_photo)
     images = [file for file in files if _suffix(file) in IMAGE_SUFFIXES]
     masks = [file for file in images if is_mask(file.name)]
     if len(masks) < len(images):  # else the photos themselves have such names
@@ -130,10 +137,17 @@ def _counted(files: list[PhotoFile]) -> str:
 
 def _file_notes(inputs: Inputs) -> list[str]:
     known = (*IMAGE_SUFFIXES, *RAW_SUFFIXES)
-    others = [file for file in inputs.files if _suffix(file) not in known]
-    if inputs.geotags is not None:
-        others = [file for file in others if file.name != inputs.geotags_name]
-    return [f"Files that are no photos are passed over, {_counted(others)}."] if others else []
+    others = [file for file in inputs.files if _suffix(file) not in known and file.name not in inputs.own_lists]
+    notes = [f"Files that are no photos are passed over, {_counted(others)}."] if others else []
+    lists = [file.name for file in others if PurePosixPath(file.name).name.lower() in FOUND_LISTS.values()]
+    if inputs.is_geotags_found:
+        notes.append(f"{inputs.geotags_name} was found among the photos (--geotags names another list, or none).")
+    if lists:
+        notes.append(
+            f"Lists below the folder, or beside one that was given, are not used: {', '.join(lists)}; give them with "
+            "--geotags or --gcp."
+        )
+    return notes
 
 
 def _camera_notes(photos: list[Photo], focal_px: float | None) -> list[str]:

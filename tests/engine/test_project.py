@@ -83,6 +83,8 @@ def test_geotags_are_those_given_else_geo_txt_among_the_photos(photos: Path, tmp
     (tmp_path / "other.csv").write_text("EPSG:32615\n")
     assert read_geotags(photos) == ("geo.txt", "EPSG:4326\n")
     assert read_geotags(photos, tmp_path / "other.csv") == ("other.csv", "EPSG:32615\n")
+    (tmp_path / "wide.csv").write_bytes("EPSG:32615\n".encode("utf-16"))  # as spreadsheets write "Unicode text"
+    assert read_geotags(photos, tmp_path / "wide.csv") == ("wide.csv", "EPSG:32615\n")
     (tmp_path / "latin.csv").write_bytes("Höhe".encode("latin-1"))
     with pytest.raises(JaxbaError, match=r"latin\.csv: cannot be read as text .* in UTF-8"):
         read_geotags(photos, tmp_path / "latin.csv")
@@ -90,9 +92,32 @@ def test_geotags_are_those_given_else_geo_txt_among_the_photos(photos: Path, tmp
         read_geotags(photos, tmp_path / "gone.csv")
 
 
+@pytest.mark.parametrize("name", ["geo.txt", "GEO.TXT", "Geo.txt"])
+@pytest.mark.parametrize("control", ["gcp_list.txt", "GCP_LIST.txt"])
+def test_lists_among_the_photos_are_found_in_any_case(photos: Path, tmp_path: Path, name: str, control: str):
+    (photos / name).write_text("EPSG:4326\n")
+    (photos / control).write_text("EPSG:32615\n")
+    (photos / "second flight" / "geo.txt").write_text("EPSG:4979\n")
+    found = read_lists(Given(photos=photos))
+    assert (found["geotags"], found["gcp"], found["check"]) == ((name, "EPSG:4326\n"), (control, "EPSG:32615\n"), None)
+    assert found["found_lists"] == ("geotags", "gcp") and found["own_lists"] == (name, control)
+    given = read_lists(Given(photos=photos, geotags=photos / "second flight" / "geo.txt", gcp=Path("none")))
+    assert given["geotags"] == ("geo.txt", "EPSG:4979\n") and given["gcp"] is None
+    assert given["found_lists"] == () and given["own_lists"] == ("second flight/geo.txt",)
+
+
+def test_two_lists_of_one_name_among_the_photos_are_refused(photos: Path):
+    (photos / "geo.txt").touch()
+    (photos / "GEO.txt").touch()
+    if len(list(photos.glob("[gG][eE][oO].txt"))) < 2:
+        pytest.skip("the file system knows no case")
+    with pytest.raises(JaxbaError, match=r"photos: holds GEO\.txt and geo\.txt; keep one of them"):
+        read_lists(Given(photos=photos))
+
+
 def test_what_a_run_was_given_and_the_stage_that_it_is_in_are_kept(tmp_path: Path):
     project = Project(tmp_path)
-    given = Given(photos=tmp_path / "photos", geotags=None)
+    given = Given(photos=tmp_path / "photos", geotags=None, gcp=Path("none"))
     project.write_given(given, "match")
     assert Project(tmp_path, make=False).read_given() == (given, "match")
     project.write_given(given, None)

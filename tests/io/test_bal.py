@@ -203,3 +203,14 @@ def test_missing_file_and_folder_are_named(tmp_path: Path):
             read(tmp_path / "none.txt")
         with pytest.raises(JaxbaError, match="is a folder; give a file in it"):
             read(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_byte_order_mark_and_blank_lines_are_passed_over(tmp_path: Path, encoding: str):
+    (tmp_path / "marked.txt").write_bytes(f"\n{TOY}\n\n".replace("\n", "\r\n\n").encode(encoding))
+    assert eqx.tree_equal(read_bal(tmp_path / "marked.txt"), read_bal(toy(tmp_path)))
+
+
+def test_a_rotation_without_meaning_is_refused_by_line(tmp_path: Path):
+    with pytest.raises(JaxbaError, match=r"line 6: camera 0 is turned by 1e\+308 radians"):
+        read_bal(toy(tmp_path, TOY.replace("0.1 0.2 0.3", "0.1 1e308 0.3")))

@@ -78,7 +78,26 @@ def test_csv_of_longitude_and_latitude_is_wgs_84():
         ("1 2 3 4 5 a.jpg", "line 1: '1 2 3 4 5 a.jpg' is no CRS"),
         ("EPSG:32615\n1 2 3 4 a.jpg", r"line 2: '1 2 3 4 a.jpg' has 5 columns; give x y z px py image"),
         ("EPSG:32615\n1 2 3,5 4 5 a.jpg", "line 2: z '3,5' is no number; write it with a point"),
-        ("EPSG:32615\n1 2 nan 4 5 a.jpg", "line 2: z 'nan' is no number"),
+        ("EPSG:32615\n1 nan 3 4 5 a.jpg", "line 2: y 'nan' is no number"),
+        (
+            "EPSG:32615\n1 2 NaN 4 5 a.jpg p\n1 2 3 4 5 b.jpg p",
+            "line 3: p has z_m 3.0, and none in gcp_list.txt line 2",
+        ),
+        ("p1,576308.6,5183424.7,198.2\n", "line 1: 'p1,576308.6,5183424.7,198.2' is no CRS; .*name, longitude and lat"),
+        ("p1;576308.6;5183424.7;198.2\n", "header that names its columns: .* px, py, image, and if known std_h"),
+        ("p1 576308.6 5183424.7 198.2\n", "has the CRS on its first line, then lines `x y z px py image name`"),
+        (
+            "label,x,y,z\np1,576308.6,5183424.7,198.2\n",
+            "line 1: columns label, x, y, z lack px, py, image; .*Coordinates",
+        ),
+        (
+            "EPSG:32615\n1,2,3,4,5,a.jpg",
+            "line 2: '1,2,3,4,5,a.jpg' has 1 columns; .*Separate columns by blanks, or name",
+        ),
+        (
+            "# CoordinateSystem: EPSG:32615\n#Label,X/Easting,Y/Northing,Z/Altitude\np,1,2,3\n",
+            "line 2: columns Label, X/Easting, Y/Northing, Z/Altitude lack px, py, image",
+        ),
         ("EPSG:4326\n44.9 -93.2 1 4 5 a.jpg", "line 2: latitude -93.2 is out of range; x is the longitude"),
         ("EPSG:32615\n1 2 3 4 5 a.jpg p\n1 2.5 3 4 5 b.jpg p", "line 3: p has y 2.5, and 2.0 in gcp_list.txt line 2"),
         ("EPSG:32615\n1 2 3 4 5 a.jpg p\n1 2 3 6 7 a.jpg p", "line 3: p is marked in a.jpg twice, at 6 7 here and 4 5"),
@@ -105,3 +124,44 @@ def test_a_cell_too_long_to_be_one_is_refused_with_its_line():
     text = "name,x,y,z,px,py,image,crs\na,1,2,3,4,5,a.jpg,EPSG:32615\n" + "x" * 200_000 + ",1,2,3,4,5,a.jpg,EPSG:32615"
     with pytest.raises(JaxbaError, match="line 3: has 1 columns where the header has 8"):
         parse_control(text)
+
+
+@pytest.mark.parametrize("word", ["NaN", "nan", "-nan", "N/A", "null", "-", "inf"])
+def test_a_height_that_is_none_is_none_in_both_forms(word: str):
+    (point,) = parse_control(f"EPSG:32615\n1 2 {word} 4 5 a.jpg p\n1 2 {word} 6 7 b.jpg p").points
+    (row,) = parse_control(f"# EPSG:32615\nname,x,y,z,px,py,image,std_v\np,1,2,{word},4,5,a.jpg,{word}").points
+    (empty,) = parse_control("EPSG:32615\n1\t2\t\t4\t5\ta b.jpg\tp 1").points
+    assert point.z_m is row.z_m is row.std_v_m is empty.z_m is None and len(point.marks) == 2
+    assert (empty.name, empty.marks[0].image, empty.marks[0].x_px) == ("p 1", "a b.jpg", 4.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "is_check"),
+    [
+        ("CHK-1", "", True),
+        ("chk-07", "", True),
+        ("CHK_a", "", True),
+        ("CHK-1", "control", False),
+        ("gcp01", "check", True),
+        ("GCP-CHK-1", "", False),
+        ("CHK1", "", False),
+        ("checker", "", False),
+    ],
+)
+def test_role_is_that_of_the_column_else_of_the_name(name: str, role: str, is_check: bool):
+    text = f"# EPSG:32615\nname,x,y,z,px,py,image,role\n{name},1,2,3,4,5,a.jpg,{role}"
+    assert parse_control(text).points[0].is_check == is_check
+    if not role:
+        assert parse_control(f"EPSG:32615\n1 2 3 4 5 a.jpg {name}").points[0].is_check == is_check
+
+
+def test_a_csv_may_stand_below_a_crs_and_its_header_in_a_comment():
+    rows = "p,1,2,3,4,5,a.jpg"
+    for head in ("EPSG:32615\nname,x,y,z,px,py,image", "# words\n# crs: 32615\n#Name,x,y,z,px,py,image"):
+        (point,) = parse_control(f"{head}\n{rows}").points
+        assert (point.name, point.crs, point.z_m) == ("p", "EPSG:32615", 3.0)
+
+
+def test_one_accuracy_is_that_of_all_axes():
+    (point,) = parse_control("# EPSG:32615\nname,x,y,z,px,py,image,Accuracy (m)\np,1,2,3,4,5,a.jpg,0.02").points
+    assert (point.std_h_m, point.std_v_m) == (0.02, 0.02)

@@ -7,7 +7,16 @@ from pathlib import Path
 import pytest
 
 import jaxba.io
-from jaxba.io import _csv_cloud, _csv_control, _gcp, _geotags, parse_control, parse_geotags, schema_markdown
+from jaxba.io import (
+    _csv_cloud,
+    _csv_control,
+    _gcp,
+    _geotags,
+    _list_cells,
+    parse_control,
+    parse_geotags,
+    schema_markdown,
+)
 
 README = (Path(jaxba.io.__file__).parent / "README.md").read_text(encoding="utf-8")
 
@@ -43,7 +52,10 @@ def test_geo_txt_is_read_as_described():
 
 
 def test_positions_as_csv_are_read_as_described():
-    degrees, metres = (parse_geotags(text, "positions.csv") for text in examples("Positions as CSV"))
+    degrees, reference, metres = (parse_geotags(text, "positions.csv") for text in examples("Positions as CSV"))
+    (entry,) = reference.entries
+    assert (entry.name, entry.position.x, entry.position.z_m) == ("DJI_0028", -91.9942096, 198.609)
+    assert (entry.position.std_h_m, entry.position.std_v_m) == (0.03, 0.03)
     first, second = degrees.entries
     assert (first.position.crs, first.position.x, first.position.y) == ("EPSG:4326", -91.9942096, 46.8425212)
     assert (first.yaw_pitch_roll_deg, first.position.std_h_m, first.position.std_v_m) == (
@@ -95,6 +107,15 @@ def test_roles_are_those_that_the_reader_takes():
         ", ".join(f"`{role}`" if role else "empty" for role in roles) for roles in (_gcp._CHECK, _gcp._CONTROL)
     )
     assert f"| check | {check} |\n| control | {control} |\n" in section("Control points as CSV")
+
+
+def test_heights_that_are_none_are_the_readers():
+    low, high = _list_cells.HEIGHTS
+    common = section("What all lists have in common")
+    assert f"below {low:,.0f} or above {high:,.0f}" in common
+    first, *others = _list_cells.FILLERS
+    assert f"a {first:g} (or {', '.join(f'{value:g}' for value in others)}) that lies apart" in common
+    assert f"more than {_list_cells._FAR:g}, or by more than {_list_cells._NEAR:g} and three times" in common
 
 
 def test_threshold_of_pitch_is_the_readers():

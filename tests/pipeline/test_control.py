@@ -13,6 +13,7 @@ from jaxba.geo import projected_from_local
 from jaxba.pipeline import control, crs, metadata
 from jaxba.pipeline._mark_turn import TURNS, expected_px
 from jaxba.pipeline.control import Inputs, Outputs, Params
+from jaxba.report import Told
 from jaxba.scene import Attitude, Photo, PhotoFile, Position, Reference
 
 LON, LAT = -92.0, 46.8
@@ -140,6 +141,47 @@ def test_heights_that_are_all_zero_were_not_measured():
     assert np.isfinite(run(gcp_list(z=0.0), heights="use").control.std_m).all()
     assert np.isinf(run(heights="ignore").control.std_m[:, 2]).all()
     assert any("all 4 heights are 3" in note for note in run(gcp_list(z=3.0)).notes)
+
+
+@pytest.mark.parametrize("none", ["NaN", "-9999", "0"])
+def test_a_point_without_a_height_is_horizontal_control_and_named(none: str):
+    made = run(gcp_list().replace(" 199.0 ", f" {none} "))
+    assert np.isinf(made.control.std_m[:, 2]).tolist() == [False, True, False, False]
+    assert np.isfinite(made.control.std_m[:, :2]).all() and np.isfinite(made.control.xyz_m).all()
+    (note,) = (note for note in made.notes if "no height" in note)
+    assert note.startswith("gcp_list.txt: 1 of 4 points has no height (") and "gcp1): horizontal control only" in note
+    kept = run(gcp_list().replace(" 199.0 ", f" {none} "), heights="use").control.std_m[1, 2]
+    assert np.isfinite(kept) == (none == "0") and ("control.heights=use" in note) == (none == "0")
+
+
+def test_points_named_chk_are_check_points_and_said():
+    text = gcp_list().replace("gcp1", "CHK-1").replace("gcp3", "chk-3").replace("gcp2", "CHK2")
+    made = run(text)
+    assert made.control.is_check.tolist() == [False, True, False, True]
+    assert "Check points by their names, CHK-...: CHK-1, chk-3." in made.notes
+    assert any(note.startswith("CHK2: used as control.") and "control.check" in note for note in made.notes)
+    told = Told(photos=(), left_out=())
+    assert control.lines(made, told)[0].startswith("2 control points, 2 check points; 16 marks")
+
+
+def test_photos_with_blanks_in_their_names_are_found_and_those_that_are_not_are_likened():
+    of = tuple(replace(photo, name=f"{photo.name[0]} (2).jpg") for photo in photos())
+    made = run(
+        gcp_list().replace("a.jpg", "a (2).jpg").replace("b.jpg", '"b (2).JPG"').replace("c.jpg", "c(2).jpg"), of=of
+    )
+    assert len(made.control.mark_point) == 8
+    left = {entry.name: entry.reason for entry in made.left_out}
+    assert "(c (2).jpg, but for blanks or marks? Write it so)" in left["c(2).jpg"] and "(" not in left["d.jpg"][60:]
+
+
+def test_a_list_found_among_the_photos_is_said_and_its_fault_has_a_way_round():
+    of = photos()
+    inputs = Inputs(photos=of, reference=reference(of), gcp=("gcp_list.txt", gcp_list()), is_gcp_found=True)
+    made = control.run(inputs, Params())
+    assert made.notes[0].startswith("gcp_list.txt was found among the photos, and is used as control")
+    assert np.array_equal(made.control.xyz_m, run().control.xyz_m)
+    with pytest.raises(JaxbaError, match=r"line 1: 'no list' is no CRS.*found among the photos.* --gcp none"):
+        control.run(replace(inputs, gcp=("gcp_list.txt", "no list")), Params())
 
 
 def test_control_far_from_the_photos_is_refused_with_what_would_bring_it_there():

@@ -128,6 +128,22 @@ def test_what_is_no_photo_is_left_out_or_counted(tmp_path: Path):
     assert "4 files: 2 .srt, 1 .txt, 1 without a suffix" in " ".join(outputs.notes)
 
 
+def test_lists_in_use_are_no_files_passed_over_and_others_are_named(tmp_path: Path):
+    write(tmp_path / "a b.jpg")
+    for name in ("GEO.TXT", "gcp_list.txt", "sub/geo.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    inputs = metadata.Inputs(
+        files=files_of(tmp_path), geotags="EPSG:32615\na b.jpg 500000 5187000 250\n", geotags_name="GEO.TXT",
+        is_geotags_found=True, own_lists=("GEO.TXT", "gcp_list.txt"),
+    )  # fmt: skip
+    notes = metadata.run(inputs, metadata.Params()).notes
+    assert notes[0] == "Files that are no photos are passed over, 1 file: 1 .txt."
+    assert notes[1].startswith("GEO.TXT was found among the photos")
+    assert "not used: sub/geo.txt; give them with --geotags or --gcp" in notes[2]
+    assert "GEO.TXT replaces the tags' positions of 1 of 1 photos." in notes
+
+
 def test_reasons_and_outputs_do_not_depend_on_where_the_folder_lies(tmp_path: Path):
     for folder in ("one", "two"):
         write(tmp_path / folder / "a.jpg")

@@ -106,7 +106,7 @@ def _binary(folder: Path) -> Binary:
 
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
         raise JaxbaError(f"{path}: is no JSON ({error}); {_CURE}.") from error
 
@@ -166,7 +166,7 @@ def _control(path: Path) -> list[dict[str, str]]:
     """Return the rows of the surveyed points; a cell is a number, or empty where nothing is known."""
     from jaxba.io._csv_control import CONTROL_COLUMNS
 
-    with open(path, encoding="utf-8", newline="") as file:
+    with open(path, encoding="utf-8-sig", newline="") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     _expect_keys(path, dict.fromkeys(header), CONTROL_COLUMNS, "column")
     table = []

@@ -166,7 +166,7 @@ def run(
 
 
 @app.command(
-    help="Tell how a project stands: stage by stage what is done, what is stale and why; failed frames and pairs.\n\n"
+    help="Tell how a project stands: stage by stage what is done, what is stale and why; failed frames; findings.\n\n"
     "Exit codes: 0 everything is done, 1 something is to be done, 2 no project."
 )
 def status(
@@ -183,7 +183,8 @@ def status(
 
 
 @app.command(
-    help="Check the exports of a project: files, form, numbers, errors, CRS and place, each with its figure.\n\n"
+    help="Check the exports of a project: files, form, numbers, errors, CRS and place, each with its figure; list the "
+    "findings of the adjustment beside them.\n\n"
     "Exit codes: 0 all is well, 1 a check failed, 2 no project, or nothing exported yet."
 )
 def verify(
@@ -201,7 +202,7 @@ def verify(
 
 @app.command(
     help="Tell what looks poor in a project, the likely cause with its figures, and the cure; also of a run that "
-    "stopped or was killed.\n\nExit codes: 0 told, 2 no project."
+    "stopped or was killed.\n\nExit codes: 0 nothing is to be acted on, 1 something is, 2 no project."
 )
 def diagnose(
     project: _Project,

@@ -13,7 +13,7 @@ from jaxba._errors import JaxbaError
 from jaxba.cli._options import BAD_INPUT, INTERRUPTED, WorkerOptions
 from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Progress, StageLines, steps_told
 from jaxba.cli._settings import configured
-from jaxba.cli._text import first_of, many, to_json, wrapped
+from jaxba.cli._text import first_of, labelled, many, to_json, wrapped
 from jaxba.engine import changed
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.pipeline import Event, Run, run_pipeline
@@ -135,7 +135,4 @@ def _result_rows(adjust: dict[str, Any], control: list[tuple[str, str]]) -> list
         used = {axis: rms for axis, rms in axes if rms is not None and math.isfinite(rms)}  # heights may not be used
         figures = ", ".join(f"{rms:.2f}" for rms in used.values())
         rows.append(("GNSS fit", f"RMS {figures} m {', '.join(used)} over {adjust['num_gnss']} positions"))
-    rows += control
-    for label, finding in zip(["findings"] + [""] * len(adjust["findings"]), adjust["findings"], strict=False):
-        rows.append((label, finding))
-    return rows
+    return [*rows, *control, *labelled("findings", adjust["findings"])]

@@ -126,7 +126,19 @@ def _convergence(adjusted: Adjusted) -> list[Finding]:
 
 
 def _edges(adjusted: Adjusted) -> list[Finding]:
-    return [Finding.of("edge left out", name=left.name, reason=left.reason) for left in adjusted.pruned]
+    """All edges that were left out, the worst first."""
+    if not adjusted.pruned:
+        return []
+    worst_first = sorted(adjusted.pruned, key=lambda edge: -edge.median_px)
+    return [
+        Finding.of(
+            "edges left out",
+            names=[edge.name for edge in worst_first],
+            matches=[edge.num_matches for edge in worst_first],
+            median_px=[edge.median_px for edge in worst_first],
+            limit_px=worst_first[0].limit_px,
+        )
+    ]
 
 
 def _images(adjusted: Adjusted, photos: Sequence[Photo]) -> list[Finding]:

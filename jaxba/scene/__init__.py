@@ -22,6 +22,6 @@ __all__ = [
     "Attitude", "Block", "Control", "ControlFit", "EdgeStatus", "Fallback", "Features", "Finding", "Fix",
     "FocalSource", "Footprints", "HeightKind", "LeftOut", "LocalFrame", "Missed", "Model", "PairRecord", "Photo",
     "PhotoFile", "Position", "PrunedEdge", "Reference", "Tracks", "ViewGraph", "build_tracks", "cam_from_enu",
-    "components", "footprint_overlaps", "footprint_pairs", "ground_footprints", "joining_pairs", "nearest_pairs", "pairs_between",
-    "window_pairs",
+    "components", "footprint_overlaps", "footprint_pairs", "ground_footprints", "joining_pairs", "nearest_pairs",
+    "pairs_between", "window_pairs",
 ]  # fmt: skip

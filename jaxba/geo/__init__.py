@@ -8,6 +8,7 @@ from jaxba.geo._control import AS_PHOTOS, Surveyed, elsewhere, heights_above, su
 from jaxba.geo._crs import describe, parse_crs, target_crs, utm_zone
 from jaxba.geo._frame import (
     geodetic_from_local,
+    grid_from_local,
     local_frame,
     local_from_geodetic,
     local_from_projected,
@@ -21,8 +22,8 @@ from jaxba.geo._positions import Measured, measured_positions
 
 __all__ = [
     "AS_PHOTOS", "UNTRUSTED", "HeightDrift", "HeightStep", "Judgement", "Measured", "Operation", "Surveyed",
-    "describe", "elsewhere", "frame_notes", "geodetic_from_local", "height_notes", "height_step", "heights_above",
-    "horizontal_operation", "judge_positions", "local_attitudes", "local_frame", "local_from_geodetic",
+    "describe", "elsewhere", "frame_notes", "geodetic_from_local", "grid_from_local", "height_notes", "height_step",
+    "heights_above", "horizontal_operation", "judge_positions", "local_attitudes", "local_frame", "local_from_geodetic",
     "local_from_projected", "measured_positions", "parse_crs", "projected_from_local", "surveyed_points",
     "target_crs", "utm_zone",
 ]  # fmt: skip

@@ -207,6 +207,7 @@ def _named(names: Sequence[str], figures: Sequence[str]) -> str:
 
 WORDS: dict[str, Callable[..., str]] = {
     "note": _note,
+    "no sigmas": _note,
     "not settled": _not_settled,
     "not converged": _not_converged,
     "large median": _large_median,

@@ -98,7 +98,7 @@ def findings(
             *_focal_and_height(block, sigmas, reference, is_controlled),
             *_intrinsics(block, start, photos),
             *_positions(block, sigmas, reference, photos, is_controlled),
-            *([Finding.of("note", text=sigmas.why_not)] if sigmas.why_not else []),
+            *([Finding.of("no sigmas", text=sigmas.why_not)] if sigmas.why_not else []),
         ]
     )
 

@@ -21,6 +21,10 @@ CASES = [
         "A note.",
     ),
     (
+        Finding.of("no sigmas", text="Sigmas were not computed."),
+        "Sigmas were not computed.",
+    ),
+    (
         Finding.of("not settled", medians_px=[1.0, 0.8, 0.55]),
         "The median error still changed after 3 rounds (1.00, 0.80, 0.55 px); set adjust.max_rounds higher, or "
         "look at the edges and images named here.",

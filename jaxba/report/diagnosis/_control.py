@@ -27,7 +27,8 @@ def poor_control(case: Recorded) -> Diagnosis | None:
         f"{name} ({over:.1f} sigmas)"
         for name, over in zip(names[fit.is_suspect], fit.over_sigma[fit.is_suspect], strict=True)
     ]
-    expected = np.nanmedian(np.hypot(fit.std_m[known], control.std_m[known]), axis=0)
+    std_m = np.hypot(fit.std_m[known], control.std_m[known])
+    expected = [np.median(std[np.isfinite(std)]) if np.isfinite(std).any() else np.nan for std in std_m.T]
     poor = []
     for role, rms in (("control", fit.control_rms_m), ("check", fit.check_rms_m)):
         for axis, value, limit in zip(("east", "north", "up"), rms, expected, strict=True):

@@ -118,7 +118,8 @@ def _files(frame: LocalFrame | None, files: Sequence[str]) -> list[str]:
             SITE_COLUMNS,
         ),
         "cameras.geojson": (
-            "the same with longitude, latitude (degrees, WGS 84) and height (metres); columns as in cameras.gpkg",
+            "the same with longitude, latitude (degrees, WGS 84) and the photos' own heights (metres); columns as in "
+            "cameras.gpkg",
             {},
         ),
         "control.csv": ("control and check points", CONTROL_COLUMNS),
@@ -138,8 +139,8 @@ def _files(frame: LocalFrame | None, files: Sequence[str]) -> list[str]:
             },
         ),
         "tile.npz": (
-            f"the adjustment problem, in {world}: `python -m jaxba solve tile.npz` solves it and `python -m jaxba info "
-            "tile.npz` tells what it holds",
+            f"the adjustment problem, in {world}: `python -m jaxba solve tile.npz` solves it (into "
+            "tile.solved.npz beside this folder) and `python -m jaxba info tile.npz` tells what it holds",
             {},
         ),
     }

@@ -71,10 +71,10 @@ def _edges_left_out(names: Sequence[str], matches: Sequence[int], median_px: Seq
     ]
     left = len(rows) - _MOST_ROWS
     more = [f"  and {left} more: summary.json, adjust.edges_left_out"] if left > 0 else []
-    were, their = ("was", "its") if len(rows) == 1 else ("were", "their")
+    were, their, photos = ("was", "its", "its photos") if len(rows) == 1 else ("were", "their", "photos of the worst")
     first = (
         f"{_many(len(rows), 'edge')} {were} left out, since {their} matches are off by over {limit_px:g} px in the "
-        "median. Look at the photos of the worst for repeated patterns or movement."
+        f"median. Look at {photos} for repeated patterns or movement."
     )
     return "\n".join([first, *rows[:_MOST_ROWS], *more])
 

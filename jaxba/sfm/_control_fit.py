@@ -61,9 +61,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
         return Controlled(block, sigmas, IDENTITY, ControlFit.nothing(control.num_points))
     scale = np.ones(2) if adjusted.control is None else adjusted.control.scale
     control = replace(control, std_m=control.std_m * scale[[0, 0, 1]])
-    held: Bool[np.ndarray, "3"] = np.isfinite(sigmas.point_std_m).any(
-        axis=0
-    )  # axes that something measured holds the block along
+    held = np.any(np.isfinite(sigmas.point_std_m), axis=0)  # the axes that something measured holds the block along
     found = intersect(block, control, adjusted.mark_used)
     variance = _pose_variance(adjusted, sigmas, found) + found.variance_m2
     method, affine, left_out = "none", IDENTITY, np.zeros(control.num_points, bool)

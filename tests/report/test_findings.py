@@ -40,8 +40,8 @@ CASES = [
     ),
     (
         Finding.of("edges left out", names=["a, b"], matches=[60], median_px=[5.12], limit_px=3.0),
-        "1 edge was left out, since its matches are off by over 3 px in the median. Look at the photos of the worst "
-        "for repeated patterns or movement.\n     5.1 px     60 matches  a, b",
+        "1 edge was left out, since its matches are off by over 3 px in the median. Look at its photos for "
+        "repeated patterns or movement.\n     5.1 px     60 matches  a, b",
     ),
     (
         Finding.of(
@@ -51,7 +51,7 @@ CASES = [
             median_px=[812.0, *np.linspace(40, 3.1, 12).tolist()],
             limit_px=3.0,
         ),
-        "13 edges were left out, since their matches are off by over 3 px in the median. Look at the photos of the "
+        "13 edges were left out, since their matches are off by over 3 px in the median. Look at photos of the "
         "worst for repeated patterns or movement.\n"
         "   812.0 px   1200 matches  p0, q0\n"
         "    40.0 px     45 matches  p1, q1\n"

@@ -216,6 +216,51 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert sorted(os.listdir(tile.parent)) == before
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "nowhere", "--json"], "nowhere: there is no such folder"),
+        (["run", "--json", "nowhere", "--log-json"], "nowhere: there is no such folder"),
+        (["run", "nowhere", "--set", "match.ratoi=1", "--json"], "match.ratoi"),
+        (["run", "--json"], "PHOTOS"),
+        (["status", "nowhere", "--json"], "is no project"),
+        (["verify", "nowhere", "--json"], "is no project"),
+        (["diagnose", "nowhere", "--json"], "is no project"),
+        (["config", "nowhere.toml", "--json"], "nowhere.toml"),
+        (["solve", "absent.npz", "--json"], "no such file"),
+        (["solve", "absent.npz", "--jason", "--json"], "Unknown option"),
+        (["gradcheck", "absent.npz", "--json"], "no such file"),
+        (["info", "absent.npz", "--json"], "no such file"),
+    ],
+)
+def test_with_json_bad_input_is_an_object(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = cli(*arguments)
+    found = json.loads(out)
+    assert code == 2 and set(found) == {"error", "exit_code"} and found["exit_code"] == 2
+    assert message in found["error"]
+    if "--log-json" in arguments:
+        assert [json.loads(line)["event"] for line in err.splitlines()] == ["run_begin", "stopped"]
+    else:
+        assert err == f"jaxba: {found['error']}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("given", ["project/export/tile.npz", "tile.npz", "../export/tile.npz", "export/tile.npz"])
+def test_the_result_of_an_exported_tile_goes_beside_the_export(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+):
+    (tmp_path / "project" / "export").mkdir(parents=True)
+    (tmp_path / "project" / "run.json").touch()
+    here = {"project/export/tile.npz": ".", "export/tile.npz": "project"}.get(given, "project/export")
+    monkeypatch.chdir(tmp_path / here)
+    assert _solve.default_output(Path(given)).resolve() == tmp_path / "project" / "tile.solved.npz"
+    (tmp_path / "project" / "run.json").unlink()  # a folder that is only named so
+    assert _solve.default_output(Path(given)).resolve() == tmp_path / "project" / "export" / "tile.solved.npz"
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_read_only_folder_is_refused_before_the_solve(cli: Cli, tile: Path):
     tile.parent.chmod(0o500)

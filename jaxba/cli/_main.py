@@ -14,7 +14,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.cli._options import BAD_INPUT, INTERRUPTED, LossName, SolveOptions, WorkerOptions
+from jaxba.cli._options import BAD_INPUT, INTERRUPTED, LossName, SolveOptions, WorkerOptions, fail
 
 _EXIT_CODES = "Exit codes: 0 converged, 1 not converged (written all the same), 2 bad input or options, 130 Ctrl-C."
 
@@ -41,24 +41,21 @@ _Json = Annotated[bool, Parameter(negative="", show_default=False, help="Print o
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command in `argv` (the process's own arguments if None) and exit with its code."""
+    arguments = sys.argv[1:] if argv is None else argv
+    as_json = "--json" in arguments
     try:
-        code = app(sys.argv[1:] if argv is None else argv, exit_on_error=False, print_error=False)
+        code = app(arguments, exit_on_error=False, print_error=False)
         sys.stdout.flush()
     except CycloptsError as error:
-        code = _fail(" ".join(str(error).split()) + " See jaxba --help.", BAD_INPUT)
+        code = fail(" ".join(str(error).split()) + " See jaxba --help.", BAD_INPUT, as_json=as_json)
     except JaxbaError as error:
-        code = _fail(str(error), BAD_INPUT)
+        code = fail(str(error), BAD_INPUT, as_json=as_json)
     except KeyboardInterrupt:
-        code = _fail("interrupted; nothing was written.", INTERRUPTED)
+        code = fail("interrupted; nothing was written.", INTERRUPTED, as_json=as_json)
     except BrokenPipeError:  # `jaxba info FILE | head`: whoever read the output has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     sys.exit(code or 0)
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"jaxba: {message}", file=sys.stderr)
-    return code
 
 
 @app.command(help=f"Adjust a problem, print a summary, write the adjusted tile.\n\n{_EXIT_CODES}")
@@ -170,7 +167,7 @@ def run(
 
 
 @app.command(
-    help="Tell how a project stands: stage by stage what is done, what is stale and why; failed frames and pairs.\n\n"
+    help="Tell how a project stands: stage by stage what is done, what is stale and why; failed frames; findings.\n\n"
     "Exit codes: 0 everything is done, 1 something is to be done, 2 no project."
 )
 def status(
@@ -187,7 +184,8 @@ def status(
 
 
 @app.command(
-    help="Check the exports of a project: files, form, numbers, errors, CRS and place, each with its figure.\n\n"
+    help="Check the exports of a project: files, form, numbers, errors, CRS and place, each with its figure; list the "
+    "findings of the adjustment beside them.\n\n"
     "Exit codes: 0 all is well, 1 a check failed, 2 no project, or nothing exported yet."
 )
 def verify(
@@ -205,7 +203,7 @@ def verify(
 
 @app.command(
     help="Tell what looks poor in a project, the likely cause with its figures, and the cure; also of a run that "
-    "stopped or was killed.\n\nExit codes: 0 told, 2 no project."
+    "stopped or was killed.\n\nExit codes: 0 nothing is to be acted on, 1 something is, 2 no project."
 )
 def diagnose(
     project: _Project,

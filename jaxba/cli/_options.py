@@ -1,6 +1,8 @@
-"""Options of `solve`, as the command line takes them, with the defaults of `jaxba.solve`; of workers; exit codes."""
+"""Options of `solve`, as the command line takes them, with the defaults of `jaxba.solve`; of workers; failing."""
 
 import dataclasses
+import json
+import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,6 +11,24 @@ from cyclopts import Parameter
 NOT_CONVERGED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 
 LossName = Literal["linear", "soft_l1", "huber", "cauchy", "arctan", "tukey", "geman_mcclure", "barron"]
+
+
+def fail(message: str, code: int, *, as_json: bool) -> int:
+    """Say on standard error why a command failed, with `--json` as an object on standard output, too; return the code.
+
+    >>> fail("nowhere: there is no such folder.", BAD_INPUT, as_json=True)
+    {"error": "nowhere: there is no such folder.", "exit_code": 2}
+    2
+    """
+    print(f"jaxba: {message}", file=sys.stderr)
+    if as_json:
+        print_error(message, code)
+    return code
+
+
+def print_error(message: str, code: int) -> None:
+    """Print the object that stands for the result of a command that failed."""
+    print(json.dumps({"error": message, "exit_code": code}))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,7 +74,8 @@ class SolveOptions:
     out: Annotated[
         Path | None,
         Parameter(
-            help="Output: a tile, or BAL text where it ends in .txt or .txt.bz2. [default: NAME.solved.npz beside FILE]"
+            help="Output: a tile, or BAL text where it ends in .txt or .txt.bz2. [default: NAME.solved.npz beside "
+            "FILE, or beside the export that FILE lies in]"
         ),
     ] = None
     json: Annotated[

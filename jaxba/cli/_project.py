@@ -1,20 +1,24 @@
-"""Commands on a project that is there: `status`, `verify`, `diagnose`; each prints what `jaxba.report` finds."""
+"""Commands on a project that is there: `status`, `verify`, `diagnose`; each prints what `jaxba.report` finds.
+
+All three list the findings of the adjustment, as the run itself does.
+"""
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxba.cli._text import many, to_json, wrapped
+from jaxba.cli._text import labelled, many, to_json, wrapped
 from jaxba.engine import changed, from_toml
 from jaxba.pipeline import PIPELINE
-from jaxba.report import Status, project_settings, status
-from jaxba.report.diagnosis import diagnose
-from jaxba.report.verification import Params, verify
+from jaxba.report import Status, is_to_act_on, project_settings, recorded, sentences, status
+from jaxba.report.diagnosis import diagnoses
+from jaxba.report.verification import Params, exported_findings, verify
 
 _SHOWN = 10
 _STATUS_LABEL = 10
 _CHECK_LABEL = 9
 _DIAGNOSIS_LABEL = 8
+_FINDINGS_LABEL = 10
 
 
 def tell_status(project: Path, *, config: Path | None, changes: Sequence[str], as_json: bool) -> int:
@@ -36,7 +40,9 @@ def _status_facts(found: Status) -> dict[str, object]:
         "activity": found.activity,
         "stages": [dataclasses.asdict(standing) for standing in found.stages],
         "left_out": [{"stage": stage, **dataclasses.asdict(left)} for stage, left in found.left_out],
+        "pairs": found.num_pairs,
         "rejected_pairs": [dataclasses.asdict(left) for left in found.rejected],
+        "findings": sentences(found.findings),
     }
 
 
@@ -51,12 +57,17 @@ def _print_status(found: Status) -> None:
     if len(found.left_out) > _SHOWN:
         rows.append(("", f"and {len(found.left_out) - _SHOWN} more files; --json has all"))
     if found.rejected:
-        names = "; ".join(f"{left.name} ({left.reason.split(',')[0]})" for left in found.rejected[:_SHOWN])
-        more = f"; and {len(found.rejected) - _SHOWN} more, see --json" if len(found.rejected) > _SHOWN else ""
-        rows.append(("rejected", f"{len(found.rejected)} pairs without an edge: {names}{more}"))
+        rows.append(
+            (
+                "pairs",
+                f"{found.num_pairs - len(found.rejected)} of {many(found.num_pairs, 'candidate pair')} became edges; "
+                "the others are mostly photos that do not overlap (--json names them)",
+            )
+        )
     rows += [("run", found.activity)] if found.activity else []
-    if not rows and found.is_done:
-        rows = [("all", "every photo is in use, and every pair")]
+    if not found.left_out and not found.activity and found.is_done:
+        rows.insert(0, ("all", "every photo is in use"))
+    rows += labelled("findings", sentences(found.findings))
     print(end="\n" if rows else "")
     for label, text in rows:
         print(wrapped(label, text, _STATUS_LABEL))
@@ -71,12 +82,17 @@ def tell_checks(project: Path, *, config: Path | None, changes: Sequence[str], a
     assert isinstance(params, Params)
     checks = verify(project, PIPELINE, params)
     bad = [check for check in checks if check.state == "FAIL"]
+    findings = sentences(exported_findings(project, PIPELINE))
     if as_json:
-        print(to_json({"passed": not bad, "checks": [dataclasses.asdict(check) for check in checks]}))
+        facts = {"passed": not bad, "checks": [dataclasses.asdict(check) for check in checks], "findings": findings}
+        print(to_json(facts))
         return 1 if bad else 0
     for check in checks:
         print(wrapped(check.state, f"{check.name}: {check.text}", _CHECK_LABEL))
     print()
+    for label, text in labelled("findings", findings):  # of the block: they do not fail its files
+        print(wrapped(label, text, _FINDINGS_LABEL))
+    print(end="\n" if findings else "")
     if bad:
         print(f"{len(bad)} of {many(len(checks), 'check')} failed: {', '.join(check.name for check in bad)}")
         return 1
@@ -86,15 +102,20 @@ def tell_checks(project: Path, *, config: Path | None, changes: Sequence[str], a
 
 
 def tell_diagnoses(project: Path, *, as_json: bool) -> int:
-    """Print each diagnosis; return 0."""
-    found = diagnose(project, PIPELINE)
+    """Print the findings of the adjustment and each diagnosis; return 1 where any is to be acted on, else 0."""
+    case = recorded(project, PIPELINE)
+    found, findings = diagnoses(case), sentences(case.findings)
+    code = 1 if found or any(map(is_to_act_on, case.findings)) else 0
     if as_json:
-        print(to_json({"diagnoses": [dataclasses.asdict(diagnosis) for diagnosis in found]}))
-        return 0
+        facts = {"findings": findings, "diagnoses": [dataclasses.asdict(diagnosis) for diagnosis in found]}
+        print(to_json(facts))
+        return code
+    for label, text in labelled("findings", findings):
+        print(wrapped(label, text, _FINDINGS_LABEL))
     for diagnosis in found:
         print(diagnosis.name)
         print(wrapped("  cause", diagnosis.cause, _DIAGNOSIS_LABEL))
         print(wrapped("  cure", diagnosis.cure, _DIAGNOSIS_LABEL))
-    if not found:
-        print("nothing looks poor")
-    return 0
+    if not code:
+        print("nothing is to be acted on" if findings else "nothing looks poor")
+    return code

@@ -10,10 +10,10 @@ from typing import Any
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.cli._options import BAD_INPUT, INTERRUPTED, WorkerOptions
+from jaxba.cli._options import BAD_INPUT, INTERRUPTED, WorkerOptions, fail, print_error
 from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Progress, StageLines, steps_told
 from jaxba.cli._settings import configured
-from jaxba.cli._text import first_of, many, to_json, wrapped
+from jaxba.cli._text import first_of, labelled, many, to_json, wrapped
 from jaxba.engine import changed
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.pipeline import Event, Run, run_pipeline
@@ -72,17 +72,21 @@ def run(
         with contextlib.nullcontext() if show is None else steps_told(show.step):
             result = run_pipeline(photos, out, settings, until=stage, geotags=geotags, gcp=gcp, check=check, tell=tell)
     except KeyboardInterrupt:
-        if json_lines is not None:
-            json_lines.say("interrupted", stage=current)
-        else:
+        said = "interrupted; what is done is kept, and the same command goes on from there."
+        if json_lines is None:
             _clear(show)
-            print("jaxba: interrupted; what is done is kept, and the same command goes on from there.", file=sys.stderr)
+            return fail(said, INTERRUPTED, as_json=as_json)
+        json_lines.say("interrupted", stage=current)
+        if as_json:
+            print_error(said, INTERRUPTED)
         return INTERRUPTED
     except JaxbaError as error:
         _clear(show)
         if json_lines is None:
             raise
         json_lines.say("stopped", stage=current, reason=str(error))
+        if as_json:
+            print_error(str(error), BAD_INPUT)
         return BAD_INPUT
     if json_lines is not None:
         json_lines.say("run_end", seconds=round(time.monotonic() - begun, 3), stages_run=list(result.stages_run))
@@ -135,7 +139,4 @@ def _result_rows(adjust: dict[str, Any], control: list[tuple[str, str]]) -> list
         used = {axis: rms for axis, rms in axes if rms is not None and math.isfinite(rms)}  # heights may not be used
         figures = ", ".join(f"{rms:.2f}" for rms in used.values())
         rows.append(("GNSS fit", f"RMS {figures} m {', '.join(used)} over {adjust['num_gnss']} positions"))
-    rows += control
-    for label, finding in zip(["findings"] + [""] * len(adjust["findings"]), adjust["findings"], strict=False):
-        rows.append((label, finding))
-    return rows
+    return [*rows, *control, *labelled("findings", adjust["findings"])]

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from jaxba.cli._options import INTERRUPTED, NOT_CONVERGED, SolveOptions
 from jaxba.cli._result import Run, facts, summary
 from jaxba.cli._text import to_json
 from jaxba.engine._compile_cache import use_compilation_cache
+from jaxba.engine._project import EXPORT, is_project
 from jaxba.geometry import LOSSES, AbstractLoss, Barron
 from jaxba.io import (
     read_problem,
@@ -115,7 +117,9 @@ def fix(problem: Problem, texts: Sequence[str]) -> Problem:
 
 
 def default_output(file: Path) -> Path:
-    """Return where the result of a file goes if nothing is said.
+    """Return where the result of a file goes if nothing is said: beside it, or beside the export of a project.
+
+    What lies in an export is what a run wrote there, and the next export replaces it.
 
     >>> default_output(Path("a/tile.npz")).as_posix(), default_output(Path("problem-49-pre.txt.bz2")).as_posix()
     ('a/tile.solved.npz', 'problem-49-pre.solved.npz')
@@ -123,7 +127,10 @@ def default_output(file: Path) -> Path:
     name = file.name
     for ending in _FILE_ENDINGS:
         name = name.removesuffix(ending)
-    return file.with_name(f"{name or file.name}.solved.npz")
+    folder = file.parent
+    if folder.absolute().name == EXPORT and is_project(folder.absolute().parent):
+        folder = Path(os.path.normpath(folder / ".."))
+    return folder / f"{name or file.name}.solved.npz"
 
 
 def _check_numbers(options: SolveOptions) -> None:

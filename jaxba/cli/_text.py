@@ -58,16 +58,28 @@ def gauge_text(free: Sequence[str]) -> str:
 
 
 def wrapped(label: str, text: str, indent: int) -> str:
-    """Return a text beside its label, wrapped to the terminal; a very long one is cut."""
-    if len(text) > _LONGEST:
-        text = textwrap.shorten(text, _LONGEST, placeholder=" ... (the rest is in summary.json)")
+    """Return a text beside its label, each of its lines wrapped to the terminal; a very long line is cut."""
     width = max(min(shutil.get_terminal_size((_MOST_COLUMNS, 24)).columns, _MOST_COLUMNS), indent + 30)
-    lines = textwrap.wrap(
-        text,
-        width,
-        initial_indent=f"{label:<{indent}}",
-        subsequent_indent=" " * indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    lines = []
+    for line in text.split("\n"):
+        if len(line) > _LONGEST:
+            line = textwrap.shorten(line, _LONGEST, placeholder=" ... (the rest is in summary.json)")
+        lines += textwrap.wrap(
+            line,
+            width,
+            initial_indent=f"{label:<{indent}}",
+            subsequent_indent=" " * indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        label = ""
     return "\n".join(lines)
+
+
+def labelled(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
+    """Return a row for each text, the first with the label.
+
+    >>> labelled("findings", ["one", "two"])
+    [('findings', 'one'), ('', 'two')]
+    """
+    return [("" if k else label, text) for k, text in enumerate(texts)]

@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from jaxba.engine._store import sha256
 from jaxba.io import cannot_write, remove_leftovers, text_of, write_atomically
 from jaxba.scene import PhotoFile
 
-SETTINGS, SUMMARY = "jaxba.toml", "summary.json"
+SETTINGS, SUMMARY, EXPORT = "jaxba.toml", "summary.json", "export"
 _RUN, _PHOTOS = "run.json", "photos.json"
 FOUND_LISTS = {"geotags": "geo.txt", "gcp": "gcp_list.txt"}
 """Names, in any case, of the lists that are used where they lie among the photos and no other is given."""
@@ -52,15 +53,17 @@ class Project:
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
         self.folder = folder
-        self.export = folder / "export"
+        self.export = folder / EXPORT
+        self._is_new, self._made = False, list[Path]()  # folders that this object made, the innermost first
         if make:
             self._make(folder)
-        elif not (folder / _RUN).is_file():
+        elif not is_project(folder):
             raise JaxbaError(f"{folder}: is no project; give the folder that `jaxba run --out` was given.")
 
-    @staticmethod
-    def _make(folder: Path) -> None:
+    def _make(self, folder: Path) -> None:
         try:
+            self._made = [place for place in (folder, *folder.parents) if not place.exists()]
+            self._is_new = bool(self._made) or (folder.is_dir() and not any(folder.iterdir()))
             folder.mkdir(parents=True, exist_ok=True)
             probe = folder / f".{os.getpid()}.probe"
             probe.touch()
@@ -76,6 +79,17 @@ class Project:
         """Return the folder of what a stage made, or made of one photo."""
         folder = self.folder / "stages" / name
         return folder if photo is None else folder / _folder_name(photo)
+
+    def remove_if_new(self) -> None:
+        """Remove what this object made, where the project's folder was not there or empty."""
+        if not self._is_new:
+            return
+        shutil.rmtree(self.folder, ignore_errors=True)
+        if not self._made:
+            self.folder.mkdir()
+        for place in self._made[1:]:
+            with contextlib.suppress(OSError):  # something else was put there meanwhile
+                place.rmdir()
 
     def remove_leftovers(self) -> None:
         """Remove what a run that was killed left half written."""
@@ -144,6 +158,11 @@ class Project:
         if remember:
             self.write_json(_PHOTOS, table)
         return tuple(found)
+
+
+def is_project(folder: Path) -> bool:
+    """Return whether a run has worked in a folder."""
+    return (folder / _RUN).is_file()
 
 
 def refuse_photo_folder(photos: Path, out: Path) -> None:

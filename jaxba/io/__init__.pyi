@@ -17,8 +17,12 @@ from ._colmap import (
     write_colmap_text as write_colmap_text,
 )
 from ._crs import CrsText as CrsText
-from ._csv_cloud import write_csv_cloud as write_csv_cloud
-from ._csv_control import ControlTable as ControlTable, write_csv_control as write_csv_control
+from ._csv_cloud import CLOUD_COLUMNS as CLOUD_COLUMNS, write_csv_cloud as write_csv_cloud
+from ._csv_control import (
+    CONTROL_COLUMNS as CONTROL_COLUMNS,
+    ControlTable as ControlTable,
+    write_csv_control as write_csv_control,
+)
 from ._gcp import (
     ControlList as ControlList,
     Mark as Mark,
@@ -42,5 +46,5 @@ from ._problem import read_problem as read_problem
 from ._read import text_of as text_of
 from ._read_colmap import ColmapModel as ColmapModel, read_colmap_text as read_colmap_text
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
-from ._sites import Sites as Sites, make_sites as make_sites
+from ._sites import SITE_COLUMNS as SITE_COLUMNS, Sites as Sites, make_sites as make_sites
 from ._tile import read_tile as read_tile, write_tile as write_tile

@@ -11,12 +11,13 @@ import os
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxba.io._atomic import write_atomically
 from jaxba.io._cloud import Cloud
 from jaxba.io._crs import CrsText
 
-COLUMNS = {
+CLOUD_COLUMNS = {
     "X": "east, in the unit of the CRS",
     "Y": "north, in the unit of the CRS",
     "Z": "height, in the height's unit",
@@ -55,18 +56,26 @@ def write_csv_cloud(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText | N
     cloud.check(label)
     code = "" if crs is None else crs.code
     measured = np.column_stack([cloud.xyz, cloud.point_id, cloud.error_px, cloud.track_length]).tolist()
-    known = np.isfinite(cloud.std_m.sum(axis=1))
-    lines = [",".join(COLUMNS)]
+    sigmas = _sigma_cells(cloud.std_m)
+    lines = [",".join(CLOUD_COLUMNS)]
     # 100,000 points take 0.46 s; pandas' to_csv takes 0.68 s, and its import 0.3 s
-    for row, std, rgb, is_known in zip(measured, cloud.std_m.tolist(), cloud.rgb.tolist(), known, strict=True):
-        sigmas = f"{std[0]:.3f},{std[1]:.3f},{std[2]:.3f}" if is_known else ",,"
-        lines.append(f"{_ROW.format(*row)},{sigmas},{rgb[0]},{rgb[1]},{rgb[2]},{code}")
+    for row, std, rgb in zip(measured, sigmas, cloud.rgb.tolist(), strict=True):
+        lines.append(f"{_ROW.format(*row)},{std},{rgb[0]},{rgb[1]},{rgb[2]},{code}")
     lines.append("")
     description = (json.dumps(_description(cloud, crs), indent=1) + "\n").encode()
     with write_atomically(path) as file:
         file.write("\n".join(lines).encode())
     with write_atomically(f"{label}.json") as file:
         file.write(description)
+
+
+def _sigma_cells(std_m: Float[np.ndarray, "points 3"]) -> list[str]:
+    """Return the three cells of each point, empty along the axes in which its sigma is not known."""
+    known = np.isfinite(std_m)
+    if known.all():
+        return [f"{x:.3f},{y:.3f},{z:.3f}" for x, y, z in std_m.tolist()]
+    rows = zip(std_m.tolist(), known.tolist(), strict=True)
+    return [",".join(f"{s:.3f}" if is_known else "" for s, is_known in zip(*row, strict=True)) for row in rows]
 
 
 def _description(cloud: Cloud, crs: CrsText | None) -> dict[str, Any]:
@@ -78,6 +87,6 @@ def _description(cloud: Cloud, crs: CrsText | None) -> dict[str, Any]:
         "unit": None if crs is None else crs.unit,
         "height_unit": None if crs is None else crs.height_unit,
         "heights": None if crs is None else crs.height_note,
-        "columns": COLUMNS,
+        "columns": CLOUD_COLUMNS,
         "wkt": None if crs is None else crs.wkt(),
     }

@@ -1,6 +1,7 @@
 """Control and check points as CSV: a line a point, surveyed and adjusted coordinates, residuals and sigmas.
 
-Coordinates have four decimals of the CRS's unit; what is not known is empty.
+Coordinates have four decimals of the CRS's unit, and residuals in the grid are the differences of what is written. What
+is not known is empty, with the reason in the last column.
 """
 
 import os
@@ -12,11 +13,31 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.io._atomic import write_atomically
 
-CONTROL_COLUMNS = (
-    "name", "role", "marks", "surveyed_x", "surveyed_y", "surveyed_z", "adjusted_x", "adjusted_y", "adjusted_z",
-    "residual_east_m", "residual_north_m", "residual_up_m", "std_east_m", "std_north_m", "std_up_m", "mark_rms_px",
-    "over_sigma", "suspect",
-)  # fmt: skip
+CONTROL_COLUMNS = {
+    "name": "name of the point in the list",
+    "role": "control, or check: compared only",
+    "marks": "marks of the point that are used",
+    "surveyed_x": "surveyed coordinate, east, in the unit of the CRS; empty where it was not measured",
+    "surveyed_y": "surveyed coordinate, north, in the unit of the CRS; empty where it was not measured",
+    "surveyed_z": "surveyed height, in the height's unit; empty where it was not measured",
+    "adjusted_x": "coordinate of the point in the block, east, in the unit of the CRS",
+    "adjusted_y": "coordinate of the point in the block, north, in the unit of the CRS",
+    "adjusted_z": "height of the point in the block, in the height's unit",
+    "residual_x": "adjusted_x minus surveyed_x, along the grid, in the unit of the CRS",
+    "residual_y": "adjusted_y minus surveyed_y, along the grid, in the unit of the CRS",
+    "residual_z": "adjusted_z minus surveyed_z, in the height's unit",
+    "residual_true_east_m": "adjusted minus surveyed along true east, metres on the ground",
+    "residual_true_north_m": "adjusted minus surveyed along true north, metres on the ground",
+    "residual_true_up_m": "adjusted minus surveyed up, metres",
+    "std_east_m": "sigma of the adjusted point along true east, metres",
+    "std_north_m": "sigma of the adjusted point along true north, metres",
+    "std_up_m": "sigma of the adjusted point up, metres",
+    "mark_rms_px": "RMS of the marks' reprojection errors, pixels",
+    "over_sigma": "largest of the three differences between point and survey over its sigma",
+    "suspect": "yes where it is larger than chance makes it",
+    "reason": "why cells of the row are empty",
+}
+_DECIMALS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,6 +46,7 @@ class ControlTable:
 
     - `surveyed`, `adjusted`: in the target CRS. `residual_m`: adjusted minus surveyed, local east, north, up.
     - `std_m`: of the adjusted point. `over_sigma`: largest difference over its sigma. `is_suspect`: beyond the limit.
+    - `reasons`: why something is not known of a point, else empty.
     """
 
     names: Sequence[str]
@@ -37,6 +59,7 @@ class ControlTable:
     mark_rms_px: Float[np.ndarray, " points"]
     over_sigma: Float[np.ndarray, " points"]
     is_suspect: Bool[np.ndarray, " points"]
+    reasons: Sequence[str]
 
 
 def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None:
@@ -46,22 +69,32 @@ def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None
     >>> path = pathlib.Path(tempfile.mkdtemp(), "control.csv")
     >>> one, row = np.ones(1), np.array([[1.0, 2.0, np.nan]])
     >>> write_csv_control(path, ControlTable(names=["a"], is_check=one > 2, num_marks=one.astype(int), surveyed=row,
-    ...     adjusted=row, residual_m=row, std_m=row, mark_rms_px=one, over_sigma=one, is_suspect=one > 2))
-    >>> print(path.read_text().splitlines()[1])
-    a,control,1,1.0000,2.0000,,1.0000,2.0000,,1.0000,2.0000,,1.0000,2.0000,,1.00,1.0,no
+    ...     adjusted=row, residual_m=row, std_m=row, mark_rms_px=one, over_sigma=one, is_suspect=one > 2,
+    ...     reasons=["no surveyed height"]))
+    >>> print(path.read_text().splitlines()[1][:68])
+    a,control,1,1.0000,2.0000,,1.0000,2.0000,,0.0000,0.0000,,1.0000,2.0000
     """
     lines = [",".join(CONTROL_COLUMNS)]
     for k, name in enumerate(table.names):
-        numbers = [*table.surveyed[k], *table.adjusted[k], *table.residual_m[k], *table.std_m[k]]
+        # of what is written, so that readers who subtract it find the same
+        surveyed, adjusted = np.round(table.surveyed[k], _DECIMALS), np.round(table.adjusted[k], _DECIMALS)
+        numbers = [
+            *surveyed,
+            *adjusted,
+            *np.round(adjusted - surveyed, _DECIMALS),
+            *table.residual_m[k],
+            *table.std_m[k],
+        ]
         # csv's writer leaves blanks and semicolons bare, and spreadsheets split at them when they are told to
         cells = [
-            '"' + name.replace('"', '""') + '"' if set(name) & set(',"; ') else name,
+            _quoted(name, ',"; '),
             "check" if table.is_check[k] else "control",
             str(table.num_marks[k]),
-            *(_cell(value, 4) for value in numbers),
+            *(_cell(value, _DECIMALS) for value in numbers),
             _cell(table.mark_rms_px[k], 2),
             _cell(table.over_sigma[k], 1),
             "yes" if table.is_suspect[k] else "no",
+            _quoted(table.reasons[k], ',"'),
         ]
         lines.append(",".join(cells))
     with write_atomically(path) as file:
@@ -69,4 +102,8 @@ def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None
 
 
 def _cell(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if np.isfinite(value) else ""
+    return f"{value + 0.0:.{decimals}f}" if np.isfinite(value) else ""
+
+
+def _quoted(text: str, special: str) -> str:
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(special) else text

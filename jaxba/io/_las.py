@@ -3,8 +3,8 @@
 LAS stores whole numbers: `coordinate = offset + scale * number`. Scale is 0.001 of the CRS's unit, the offset the whole
 number of units nearest to the cloud's middle, so that a coordinate is off by half a scale at most wherever the cloud
 lies. The CRS stands in the header as well-known text, compound with its heights where it is. Colours are 16 bits wide:
-255 becomes 65535. Errors and track lengths are extra dimensions. The date in the header is fixed: the same cloud gives
-the same bytes.
+255 becomes 65535. Errors and track lengths are extra dimensions. The date in the header is the day of the flight, or
+none: the same cloud gives the same bytes.
 """
 
 import datetime
@@ -20,12 +20,12 @@ from jaxba.io._crs import CrsText
 
 SCALE = 0.001
 _RGB_POINTS = 7  # LAS 1.4 point format with colours, the lowest that knows WKT and colours
-_DATE = datetime.date(2000, 1, 1)
+_DATE_BYTES = slice(90, 94)  # of the header: day of the year and year, 16 bits each
 _MOST = 2**31 - 1
 
 
-def write_las(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText) -> None:
-    """Write a cloud, compressed where the name ends in `.laz`, whole or not at all.
+def write_las(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText, *, date: datetime.date | None = None) -> None:
+    """Write a cloud, compressed where the name ends in `.laz`, whole or not at all; `date`: the day of the flight.
 
     Raises:
         JaxbaError: no points, coordinates that are not finite or more than 2147 km of units apart from the middle; or
@@ -49,7 +49,7 @@ def write_las(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText) -> None:
     header = laspy.LasHeader(version="1.4", point_format=_RGB_POINTS)
     header.generating_software = "jaxba"
     header.system_identifier = "jaxba"
-    header.creation_date = _DATE
+    header.creation_date = date or datetime.date.min  # laspy takes today for none
     header.scales = np.full(3, SCALE)
     header.offsets = np.round((cloud.xyz.min(axis=0) + cloud.xyz.max(axis=0)) / 2)
     number = np.round((cloud.xyz - header.offsets) / SCALE)
@@ -78,5 +78,8 @@ def write_las(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText) -> None:
     las["point_id"] = cloud.point_id.astype(np.uint32)
     buffer = io.BytesIO()
     las.write(buffer, do_compress=label.lower().endswith(".laz"))
+    content = bytearray(buffer.getvalue())
+    if date is None:
+        content[_DATE_BYTES] = bytes(4)  # what is not used is zero (LAS 1.4 R15, 2)
     with write_atomically(path) as file:
-        file.write(buffer.getvalue())
+        file.write(content)

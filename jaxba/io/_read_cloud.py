@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.io._cloud import Cloud
-from jaxba.io._csv_cloud import COLUMNS
+from jaxba.io._csv_cloud import CLOUD_COLUMNS
 from jaxba.io._ply import PLY_TYPES, VERTEX
 from jaxba.io._read import read_bytes, text_of
 
@@ -45,11 +45,15 @@ def read_csv_cloud(path: str | os.PathLike[str]) -> CloudFile:
         header, *cells = lines
     except csv.Error as error:
         raise JaxbaError(f"{label}, line {lines.line_num}: {error}; {_CURE}.") from error
-    _expect_columns(label, header, tuple(COLUMNS))
+    _expect_columns(label, header, tuple(CLOUD_COLUMNS))
     for number, row in enumerate(cells, 2):
-        if len(row) != len(COLUMNS):
-            raise JaxbaError(f"{label}, line {number}: {len(row)} values in {len(COLUMNS)} columns; {_CURE}.")
-    columns = dict(zip(COLUMNS, zip(*cells, strict=True), strict=True)) if cells else {name: () for name in COLUMNS}
+        if len(row) != len(CLOUD_COLUMNS):
+            raise JaxbaError(f"{label}, line {number}: {len(row)} values in {len(CLOUD_COLUMNS)} columns; {_CURE}.")
+    columns = (
+        dict(zip(CLOUD_COLUMNS, zip(*cells, strict=True), strict=True))
+        if cells
+        else {name: () for name in CLOUD_COLUMNS}
+    )
     codes = sorted(set(columns.pop("EPSG")))
     if len(codes) > 1:
         raise JaxbaError(f"{label}: column EPSG holds several codes, {', '.join(codes[:3])}; {_CURE}.")

@@ -8,12 +8,7 @@ from jaxtyping import Bool, Float
 
 from jaxba._errors import JaxbaError
 from jaxba.io._geopackage import LAYER
-
-COLUMNS = (
-    "name", "camera", "registered", "std_e_m", "std_n_m", "std_u_m", "gnss_residual_e_m", "gnss_residual_n_m",
-    "gnss_residual_u_m", "yaw_deg", "pitch_deg", "roll_deg", "heading_deg", "num_observations", "median_error_px",
-    "reason",
-)  # fmt: skip
+from jaxba.io._sites import SITE_COLUMNS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,12 +43,12 @@ def read_sites(path: str | os.PathLike[str]) -> SitesFile:
     except (DataSourceError, DataLayerError, ValueError) as error:
         raise JaxbaError(f"{label}: its layer {LAYER!r} cannot be read ({error}); export it again.") from error
     fields = [str(field) for field in meta["fields"]]
-    missing = [name for name in COLUMNS if name not in fields]
-    unknown = [name for name in fields if name not in COLUMNS]
+    missing = [name for name in SITE_COLUMNS if name not in fields]
+    unknown = [name for name in fields if name not in SITE_COLUMNS]
     for names, what in ((missing, "is missing"), (unknown, "is not known")):
         if names:
             raise JaxbaError(
-                f"{label}: column {', '.join(names)} {what}; expected are {', '.join(COLUMNS)}. Export it again."
+                f"{label}: column {', '.join(names)} {what}; expected are {', '.join(SITE_COLUMNS)}. Export it again."
             )
     table = dict(zip(fields, columns, strict=True))
     places = shapely.get_coordinates(shapely.from_wkb(geometry), include_z=True)

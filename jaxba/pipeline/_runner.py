@@ -32,6 +32,8 @@ from jaxba.pipeline._stages import NAMES, STAGES
 from jaxba.report import summary, told_of
 from jaxba.scene import LeftOut, described
 
+_FIRST_MADE = "pairs"  # the stages before it only read what a run is given
+
 
 def run_pipeline(
     photos: Path,
@@ -53,7 +55,8 @@ def run_pipeline(
     `if __name__ == "__main__":`.
 
     Raises `JaxbaError` where the photos, the parameters or the folder make a result impossible, and where another run
-    works on the project; the stages before it are kept.
+    works on the project; the stages before it are kept. Where what was given is refused before anything was made of the
+    photos, a new project folder is removed again.
     """
     if until is not None and until not in NAMES:
         raise JaxbaError(f"stage {until!r}: choose one of {', '.join(NAMES)}.")
@@ -62,9 +65,14 @@ def run_pipeline(
     with locked(project.folder):
         project.remove_leftovers()
         given = Given(photos=photos, geotags=geotags, gcp=gcp, check=check)
-        done = Done(files=project.photo_files(photos), settings=settings, **read_lists(given))
-        project.write_text(SETTINGS, to_toml(settings))
-        return _run_stages(project, given, done, until, tell)
+        try:
+            done = Done(files=project.photo_files(photos), settings=settings, **read_lists(given))
+            project.write_text(SETTINGS, to_toml(settings))
+            return _run_stages(project, given, done, until, tell)
+        except JaxbaError:
+            if not project.stage(_FIRST_MADE).exists():
+                project.remove_if_new()
+            raise
 
 
 def _run_stages(project: Project, given: Given, done: Done, until: str | None, tell: Callable[[Event], None]) -> Run:

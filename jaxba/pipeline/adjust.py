@@ -17,8 +17,8 @@ from jaxba.scene import (
     ControlFit,
     Features,
     Finding,
-    LeftOut,
     Photo,
+    PrunedEdge,
     Reference,
     Tracks,
     ViewGraph,
@@ -79,7 +79,7 @@ class Outputs:
     - `median_px`, `inlier_rate`, `variance_factor`, `num_rejected`, `rounds`: figures of the adjustment.
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
-    - `pruned`: edges left out, with the reason. `solver`: why the last solve stopped, as `Solution.result` names it.
+    - `pruned`: edges left out, with their figures. `solver`: why the last solve stopped, as `Solution.result` names it.
     - `gnss_offset_m`: added to measured positions, an axis, where control fixes the block; else 0.
     - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
     - `affine`: 3 x 4, what coordinates take beside the block, of `control.method=affine`; else the identity.
@@ -103,7 +103,7 @@ class Outputs:
     std_px: float
     position_scale: Float[np.ndarray, "3"]
     findings: tuple[Finding, ...] = ()
-    pruned: tuple[LeftOut, ...] = ()
+    pruned: tuple[PrunedEdge, ...] = ()
     solver: str = ""
     gnss_offset_m: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     control: ControlFit = field(default_factory=ControlFit.nothing)
@@ -209,6 +209,7 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
             name: {"parameters": list(map(float, row)), "std": list(map(float, std))} for name, row, std in cameras
         },
         "findings": sentences(outputs.findings),
+        "edges_left_out": [dataclasses.asdict(edge) for edge in outputs.pruned],
     }
     if not told.control.num_points:
         return {"adjust": adjusted}

@@ -4,6 +4,7 @@ Everything before is computed in the local frame; here each point takes the whol
 """
 
 import dataclasses
+import datetime
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,8 +17,11 @@ from jaxba.engine._parameters import Parameters
 from jaxba.engine._store import sha256
 from jaxba.engine._words import many
 from jaxba.pipeline import adjust
+from jaxba.pipeline._export_readme import readme, why_empty
 from jaxba.report import Told
 from jaxba.scene import Block, Control, LocalFrame, Photo, Reference, described
+
+_README = "README.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +78,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     io.write_csv_cloud(folder / "cloud.csv", cloud, crs)
     io.write_ply(folder / "cloud.ply", cloud, crs)
     if frame is not None and crs is not None:
-        io.write_las(folder / "cloud.laz", cloud, crs)
-        _write_sites(inputs, frame, crs)
+        date = _flight_date(photos)
+        io.write_las(folder / "cloud.laz", cloud, crs, date=date)
+        _write_sites(inputs, frame, crs, date)
         _write_control(inputs, frame)
     _write_colmap(folder / "colmap", block, photos, adjusted.point_error_px, frame, inputs.photos)
     gnss = inputs.reference.xyz_m[block.image_index], inputs.reference.std_m[block.image_index]
@@ -85,9 +90,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     notes += odd
     if picture is not None:
         _write(folder / "cloud.png", picture)
-    _write(folder / "README.txt", _readme(notes).encode())
-    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    return Outputs(files=tuple(files), sha256=tuple(sha256(folder / name) for name in files), notes=tuple(notes))
+    names = sorted([*(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()), _README])
+    _write(folder / _README, readme(frame, adjusted, notes, names).encode())
+    return Outputs(files=tuple(names), sha256=tuple(sha256(folder / name) for name in names), notes=tuple(notes))
 
 
 def lines(outputs: Outputs, told: Told) -> list[str]:
@@ -124,7 +129,13 @@ def _crs_text(frame: LocalFrame) -> Any:
     )
 
 
-def _write_sites(inputs: Inputs, frame: LocalFrame, crs: Any) -> None:
+def _flight_date(photos: list[Photo]) -> datetime.date | None:
+    """Return the day of the last photo, which files are dated by; None where no photo tells its time."""
+    days = [photo.time[:10] for photo in photos if photo.time]
+    return datetime.date.fromisoformat(max(days)) if days else None
+
+
+def _write_sites(inputs: Inputs, frame: LocalFrame, crs: Any, date: datetime.date | None) -> None:
     """Write the cameras, also those that are measured but not registered."""
     from jaxba import geo, io
 
@@ -136,9 +147,10 @@ def _write_sites(inputs: Inputs, frame: LocalFrame, crs: Any) -> None:
         std_m=adjusted.position_std_m,
         gnss_residual_m=adjusted.gnss_residual_m,
         error_px=adjusted.error_px,
+        grid_from_local=geo.grid_from_local(frame, adjusted.block.centers_m),
     )
     xyz_m = np.where(sites.is_registered[:, None], _mapped(inputs, sites.xyz_m), sites.xyz_m)
-    io.write_geopackage(inputs.folder / "cameras.gpkg", sites, _in_crs(frame, xyz_m), crs)
+    io.write_geopackage(inputs.folder / "cameras.gpkg", sites, _in_crs(frame, xyz_m), crs, date=date)
     geodetic = geo.geodetic_from_local(frame, xyz_m)
     heights = f"Heights are in the photos' own height system ({frame.height_datum}), metres."
     io.write_geojson(inputs.folder / "cameras.geojson", sites, geodetic, description=heights)
@@ -163,6 +175,7 @@ def _write_control(inputs: Inputs, frame: LocalFrame) -> None:
         mark_rms_px=fit.mark_rms_px,
         over_sigma=fit.over_sigma,
         is_suspect=fit.is_suspect,
+        reasons=[why_empty(*row) for row in zip(known, fit.num_marks, fit.adjusted_m, fit.std_m, strict=True)],
     )
     io.write_csv_control(inputs.folder / "control.csv", table)
 
@@ -298,27 +311,6 @@ def _name_notes(photos: list[Photo]) -> list[str]:
         f"COLMAP's text ends a photo's name at a space: {len(spaced)} names have %20 for it in colmap/text, first "
         f"{spaced[0]!r}; colmap/binary has them as they are."
     ]
-
-
-def _readme(notes: list[str]) -> str:
-    return "\n\n".join(["Results of jaxba.", *notes, _FILES])
-
-
-_FILES = """\
-PointID of cloud.csv, point_id of cloud.ply and cloud.laz, POINT3D_ID of COLMAP and the point's key of OpenSfM are one
-number. Sigmas are along local east, north, up, in metres.
-
-cloud.csv, cloud.csv.json    points in the target CRS, and what the columns are
-cloud.ply                    the same in full doubles: load it with a global shift where the viewer has one
-cloud.laz                    the same as LAS 1.4 with the CRS in the header; numbers to a thousandth of the unit
-cloud.png                    the cloud from above
-cameras.gpkg                 the photos' places in the target CRS; registered or not, sigmas, GNSS residuals
-cameras.geojson              the same, longitude and latitude on WGS 84
-colmap/binary, colmap/text   the model for COLMAP; its world is local, as frame.json beside it says
-reconstruction.json          the model for OpenSfM; its world is the same local one
-control.csv                  control and check points, where a list was given: surveyed, adjusted, residuals, sigmas
-tile.npz                     the adjustment problem: python -m jaxba solve tile.npz
-"""
 
 
 def _write(path: Path, content: bytes) -> None:

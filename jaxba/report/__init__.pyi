@@ -1,6 +1,6 @@
 from . import diagnosis as diagnosis, verification as verification
 from ._control import control_facts as control_facts, control_lines as control_lines, control_rows as control_rows
-from ._findings import sentence as sentence, sentences as sentences
+from ._findings import is_to_act_on as is_to_act_on, sentence as sentence, sentences as sentences
 from ._pairs import pair_facts as pair_facts, pair_lines as pair_lines
 from ._picture import Picture as Picture, draw_picture as draw_picture
 from ._reasons import grouped as grouped, with_ranges as with_ranges

@@ -11,6 +11,17 @@ _PARTS = {
 }
 
 
+def along_axes(values: Sequence[float], form: str) -> str:
+    """Return metres along east, north and up in words, those that are known.
+
+    >>> along_axes([0.5, -0.25, math.nan], "+.2f")
+    'east +0.50, north -0.25 m'
+    """
+    axes = zip(("east", "north", "up"), values, strict=True)
+    known = [f"{axis} {value:{form}}" for axis, value in axes if math.isfinite(value)]
+    return f"{', '.join(known)} m" if known else "not known"
+
+
 def _without_a_place() -> str:
     return "The block has no place on earth, so that its control and check points cannot be compared with it."
 
@@ -77,21 +88,20 @@ def _scatters(count: int, axes: Sequence[str], scatter_m: Sequence[float], state
 def _contradicts(
     name: str, is_check: bool, residual_m: Sequence[float], over_sigma: float, limit: float, method: str
 ) -> str:
-    residual = ", ".join(f"{value:+.3f}" if math.isfinite(value) else "none" for value in residual_m)
     part = "" if is_check else _PARTS.get(method, "")
     return (
-        f"{'Check' if is_check else 'Control'} point {name} contradicts the block: adjusted minus surveyed {residual} "
-        f"m east, north, up, {over_sigma:.1f} sigmas where {limit:g} are exceeded by chance in one of a thousand. "
-        f"Check its coordinates, its name and its marks.{part}"
+        f"{'Check' if is_check else 'Control'} point {name} contradicts the block: adjusted minus surveyed "
+        f"{along_axes(residual_m, '+.3f')}, {over_sigma:.1f} sigmas where {limit:g} are exceeded by chance in one of a "
+        f"thousand. Check its coordinates, its name and its marks.{part}"
     )
 
 
 def _gnss_off(offset_m: Sequence[float], std_m: Sequence[float], is_compared: bool) -> str:
-    figures = ", ".join(f"{value:+.2f}" if math.isfinite(value) else "unknown" for value in offset_m)
     how = "compared only" if is_compared else "the block follows control"
+    known = [std if math.isfinite(offset) else math.inf for offset, std in zip(offset_m, std_m, strict=True)]
     return (
-        f"GNSS positions minus the block as control places it: {figures} m east, north, up, for all photos in common, "
-        f"with sigmas of {', '.join(f'{s:.2g}' for s in std_m)} m; {how}. Decimetres are the antenna's offset; metres "
+        f"GNSS positions minus the block as control places it: {along_axes(offset_m, '+.2f')}, for all photos in "
+        f"common, with sigmas of {along_axes(known, '.2g')}; {how}. Decimetres are the antenna's offset; metres "
         "and tens of metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the two."
     )
 

@@ -1,15 +1,19 @@
 """Findings in words: what a surveyor should know of an adjusted block, in a sentence or two with figures and cure.
 
-Which findings hold is decided in `jaxba.sfm` by figures alone; other words here rerun no solve.
+Which findings hold is decided in `jaxba.sfm` by figures alone; other words here rerun no solve. The run, `status`,
+`diagnose` and `verify` all tell the findings that the stage adjust recorded, in these words. What is not known is left
+out of a sentence.
 """
 
 import math
 from collections.abc import Callable, Sequence
 
-from jaxba.report._control_findings import CONTROL_WORDS
+from jaxba.report._control_findings import CONTROL_WORDS, along_axes
 from jaxba.scene import Finding
 
 _MOST_NAMES = 10
+_MOST_ROWS = 8
+_TO_KNOW = ("edges left out", "common offset")
 _LOOKS = {
     "down from one height": " (all photos look straight down from one height)",
     "down": " (photos look straight down)",
@@ -18,10 +22,10 @@ _LOOKS = {
 
 
 def sentence(finding: Finding) -> str:
-    """Return a finding in words.
+    """Return a finding in words; a table has a line for each row.
 
-    >>> sentence(Finding.of("edge left out", name="a.jpg, b.jpg", reason="12 matches are off by 5.1 px"))
-    'Edge left out: a.jpg, b.jpg: 12 matches are off by 5.1 px.'
+    >>> sentence(Finding.of("image lost", name="a.jpg", reason="fewer than 3 of its features fit"))
+    'Image lost in the adjustment: a.jpg: fewer than 3 of its features fit.'
     """
     return WORDS[finding.kind](**finding.figures)
 
@@ -29,6 +33,11 @@ def sentence(finding: Finding) -> str:
 def sentences(findings: Sequence[Finding]) -> list[str]:
     """Return findings in words, in their order."""
     return [sentence(finding) for finding in findings]
+
+
+def is_to_act_on(finding: Finding) -> bool:
+    """Return whether a finding asks for something, and does not only tell what was done or how to read a figure."""
+    return finding.kind not in _TO_KNOW
 
 
 def _note(text: str) -> str:
@@ -54,8 +63,20 @@ def _large_median(median_px: float) -> str:
     )
 
 
-def _edge_left_out(name: str, reason: str) -> str:
-    return f"Edge left out: {name}: {reason}."
+def _edges_left_out(names: Sequence[str], matches: Sequence[int], median_px: Sequence[float], limit_px: float) -> str:
+    """Return a table, the worst edge first as it is given."""
+    rows = [
+        f"  {error:6.1f} px  {count:5d} matches  {name}"
+        for name, count, error in zip(names, matches, median_px, strict=True)
+    ]
+    left = len(rows) - _MOST_ROWS
+    more = [f"  and {left} more: summary.json, adjust.edges_left_out"] if left > 0 else []
+    were, their, photos = ("was", "its", "its photos") if len(rows) == 1 else ("were", "their", "photos of the worst")
+    first = (
+        f"{_many(len(rows), 'edge')} {were} left out, since {their} matches are off by over {limit_px:g} px in the "
+        f"median. Look at {photos} for repeated patterns or movement."
+    )
+    return "\n".join([first, *rows[:_MOST_ROWS], *more])
 
 
 def _image_lost(name: str, reason: str) -> str:
@@ -72,11 +93,11 @@ def _few_points(names: Sequence[str], points: Sequence[int], least: int) -> str:
 def _positions_contradict(
     names: Sequence[str], residual_m: Sequence[Sequence[float]], measured: int, sigmas: float
 ) -> str:
-    figures = [", ".join(f"{r:+.1f}" if math.isfinite(r) else "none" for r in row) + " m" for row in residual_m]
+    figures = [along_axes(row, "+.1f") for row in residual_m]
+    verb, count = ("contradicts", "counts") if len(names) == 1 else ("contradict", "count")
     return (
-        f"{_many(len(names), 'measured position')} of {measured} contradict the photos by more than "
-        f"{sigmas:g} robust sigmas and hardly count (adjusted minus measured, east, north, up): "
-        f"{_named(names, figures)}."
+        f"{_many(len(names), 'measured position')} of {measured} {verb} the photos by more than {sigmas:g} robust "
+        f"sigmas and hardly {count} (adjusted minus measured): {_named(names, figures)}."
     )
 
 
@@ -114,12 +135,14 @@ def _focal_and_height(
     above_ground_m: float | None = None,
     above_take_off_m: float | None = None,
 ) -> str:
-    share = std_px / focal_px
-    text = (
-        f"Focal length and height trade off{_LOOKS[looks]}: {parameter} is {focal_px:.1f} px with a sigma of "
-        f"{std_px:.1f} px ({share:.1%}), which alone makes the height above ground of {height_m:.1f} m uncertain by "
-        f"{share * height_m:.1f} m."
-    )
+    text = f"Focal length and height trade off{_LOOKS[looks]}: {parameter} is {focal_px:.1f} px"
+    if math.isfinite(std_px):
+        share = std_px / focal_px
+        text += (
+            f" with a sigma of {std_px:.1f} px ({share:.1%}), which alone makes the height above ground of "
+            f"{height_m:.1f} m uncertain by {share * height_m:.1f} m"
+        )
+    text += "."
     if above_ground_m is not None and above_take_off_m is not None:
         ratio = above_ground_m / above_take_off_m
         text += (
@@ -184,10 +207,11 @@ def _named(names: Sequence[str], figures: Sequence[str]) -> str:
 
 WORDS: dict[str, Callable[..., str]] = {
     "note": _note,
+    "no sigmas": _note,
     "not settled": _not_settled,
     "not converged": _not_converged,
     "large median": _large_median,
-    "edge left out": _edge_left_out,
+    "edges left out": _edges_left_out,
     "image lost": _image_lost,
     "few points": _few_points,
     "positions contradict": _positions_contradict,

@@ -44,7 +44,10 @@ def pair_lines(graph: ViewGraph, record: PairRecord) -> list[str]:
         (weak, f"{{}} with {_range(verified[weak])} verified matches (match.min_good)"),
         (loose, f"{{}} with {_range(share[loose])}% of the matches verified (match.min_inlier_ratio)"),
     ]
-    for word, found in (("Rejected (match.min_inliers)", rejected), ("Weak", weaker)):
+    for word, found in (
+        ("No overlap, or none found (match.min_inliers)", rejected),
+        ("Weak", weaker),
+    ):
         texts = [text.format(_pairs(int(rows.sum()))) for rows, text in found if rows.any()]
         if texts:
             lines.append(f"{word}: {', '.join(texts)}.")

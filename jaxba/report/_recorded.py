@@ -11,7 +11,7 @@ from jaxba.engine._settings import from_toml
 from jaxba.engine._stage import Pipeline
 from jaxba.engine._work import collected, works
 from jaxba.report._summary import left_out_by_last_run
-from jaxba.scene import LeftOut
+from jaxba.scene import Finding, LeftOut
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +32,11 @@ class Recorded:
     running: str | None
     stale: str | None
     failed: dict[str, tuple[LeftOut, ...]]
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the adjustment found; none before it."""
+        return () if self.done.adjust is None else self.done.adjust.findings
 
 
 def recorded(folder: Path, pipeline: Pipeline) -> Recorded:

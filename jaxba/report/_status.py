@@ -16,7 +16,7 @@ from jaxba.engine._settings import Settings, from_toml
 from jaxba.engine._stage import Pipeline, Stage, left_out
 from jaxba.engine._work import collected, why_to_do, works
 from jaxba.report._summary import left_out_by_last_run
-from jaxba.scene import EdgeStatus, LeftOut
+from jaxba.scene import EdgeStatus, Finding, LeftOut
 
 State = Literal["done", "stale", "partly done", "not done", "waits"]
 _REASONS = 3
@@ -44,13 +44,17 @@ class Status:
     """How a project stands.
 
     - `stages`: in their order. `left_out`: files that could not be used, by stage, in those that are done.
-    - `rejected`: candidate pairs without an edge, `a.jpg, b.jpg` each, with the number of their matches.
+    - `rejected`: of the `num_pairs` candidate pairs those without an edge, `a.jpg, b.jpg` each, with the number of
+      their matches: mostly photos that do not overlap.
+    - `findings`: of the adjustment, where it is done.
     - `activity`: who works on it, or where the last run was stopped, in words; empty where it ended.
     """
 
     stages: tuple[Standing, ...]
     left_out: tuple[tuple[str, LeftOut], ...]
     rejected: tuple[LeftOut, ...]
+    num_pairs: int
+    findings: tuple[Finding, ...]
     activity: str
 
     @property
@@ -90,6 +94,8 @@ def status(folder: Path, pipeline: Pipeline, settings: Settings) -> Status:
         if done is None
         else tuple((s, left) for s, found in left_out(pipeline.stages, done).items() for left in found),
         rejected=() if done is None else _rejected(done),
+        num_pairs=0 if done is None or done.match is None else len(done.match.view_graph.pairs),
+        findings=() if done is None or done.adjust is None else done.adjust.findings,
         activity=_activity(project, given, stage_now),
     )
 

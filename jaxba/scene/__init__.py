@@ -17,12 +17,12 @@ from jaxba.scene._photo import Fix, FocalSource, HeightKind, LeftOut, Lens, Phot
 from jaxba.scene._reference import LocalFrame, Reference
 from jaxba.scene._track_building import build_tracks
 from jaxba.scene._tracks import Tracks
-from jaxba.scene._view_graph import EdgeStatus, ViewGraph
+from jaxba.scene._view_graph import EdgeStatus, PrunedEdge, ViewGraph
 
 __all__ = [
     "Attitude", "Block", "Control", "ControlFit", "EdgeStatus", "Fallback", "Features", "Finding", "Fix",
     "FocalSource", "Footprints", "HeightKind", "LeftOut", "Lens", "LocalFrame", "Missed", "Model", "PairRecord",
-    "Photo", "PhotoFile", "Position", "Reference", "Tracks", "ViewGraph", "build_tracks", "cam_from_enu",
-    "components", "described", "fault", "footprint_overlaps", "footprint_pairs", "ground_footprints", "joining_pairs",
-    "lacks_memory", "nearest_pairs", "pairs_between", "window_pairs",
+    "Photo", "PhotoFile", "Position", "PrunedEdge", "Reference", "Tracks", "ViewGraph", "build_tracks",
+    "cam_from_enu", "components", "described", "fault", "footprint_overlaps", "footprint_pairs", "ground_footprints",
+    "joining_pairs", "lacks_memory", "nearest_pairs", "pairs_between", "window_pairs",
 ]  # fmt: skip

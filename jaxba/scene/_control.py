@@ -67,7 +67,8 @@ class ControlFit:
     """How a result fits its surveyed points, one row a point of `Control`; NaN where a point or axis has no answer.
 
     - `adjusted_m`: the point in the result, local frame. `residual_m`: adjusted minus surveyed, east, north, up.
-    - `std_m`: predicted sigma of the adjusted point. `num_marks`: used. `mark_rms_px`: of their errors.
+    - `std_m`: predicted sigma of the adjusted point; NaN along an axis that nothing measured holds the block along, and
+      after a fit of 7 or 12 parameters that of its marks alone. `num_marks`: used. `mark_rms_px`: of their errors.
     - `over_sigma`: the largest of the three differences between point and survey over its predicted sigma.
     - `is_suspect`: over the limit of the blunder test.
     - `scale`: that sigmas of control were multiplied by, horizontal and vertical, since the points scatter by that.

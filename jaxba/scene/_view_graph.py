@@ -19,6 +19,20 @@ class EdgeStatus(enum.IntEnum):
     GOOD = 2
 
 
+@dataclass(frozen=True, kw_only=True)
+class PrunedEdge:
+    """An edge that the adjustment left out, since its matches do not fit the block.
+
+    - `name`: both photos, as `a.jpg, b.jpg`. `num_matches`: verified ones.
+    - `median_px`: what they are off by in the median, over the limit `limit_px`.
+    """
+
+    name: str
+    num_matches: int
+    median_px: float
+    limit_px: float
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViewGraph:
     """Candidate pairs in rising order, with what verification made of each.

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from jaxba._errors import JaxbaError
 from jaxba.ba import Problem, Solution
 from jaxba.geometry import AbstractLoss
-from jaxba.scene import Block, Control, Features, LeftOut, Photo, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, Control, Features, LeftOut, Photo, PrunedEdge, Reference, Tracks, ViewGraph
 from jaxba.sfm._complete import complete_tracks
 from jaxba.sfm._control import ControlPart, agreeing_marks
 from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, without_edges
@@ -62,7 +62,7 @@ class Adjusted:
     num_judged: int
     medians_px: tuple[float, ...]
     converged: bool
-    pruned: tuple[LeftOut, ...]
+    pruned: tuple[PrunedEdge, ...]
     lost: tuple[LeftOut, ...]
     notes: tuple[str, ...]
     mark_used: Bool[np.ndarray, " marks"]

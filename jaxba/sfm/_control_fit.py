@@ -61,6 +61,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
         return Controlled(block, sigmas, IDENTITY, ControlFit.nothing(control.num_points))
     scale = np.ones(2) if adjusted.control is None else adjusted.control.scale
     control = replace(control, std_m=control.std_m * scale[[0, 0, 1]])
+    held = np.any(np.isfinite(sigmas.point_std_m), axis=0)  # the axes that something measured holds the block along
     found = intersect(block, control, adjusted.mark_used)
     variance = _pose_variance(adjusted, sigmas, found) + found.variance_m2
     method, affine, left_out = "none", IDENTITY, np.zeros(control.num_points, bool)
@@ -75,6 +76,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
         similarity, scores, left_out = _snooped(found.point_m, control.xyz_m, std, use)
         block = transformed(block, similarity)
         found = replace(found, point_m=similarity.points(found.point_m))
+        held = np.array([True, True, held[2] or determines_tilt(control.xyz_m[use], control.std_m[use])])
         if method == "affine":
             affine = fit_affine(*(part[use & ~left_out] for part in (found.point_m, control.xyz_m, std)))
         sigmas = _without_absolute(sigmas)
@@ -104,7 +106,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
         ControlFit(
             adjusted_m=points,
             residual_m=residual,
-            std_m=np.sqrt(variance),
+            std_m=np.where(held, np.sqrt(variance), np.nan),
             num_marks=found.num_marks,
             mark_rms_px=_mark_rms(found, control, adjusted.mark_used),
             over_sigma=over,

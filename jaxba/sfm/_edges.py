@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from jaxba.scene import LeftOut, Photo, Tracks, ViewGraph
+from jaxba.scene import Photo, PrunedEdge, Tracks, ViewGraph
 from jaxba.sfm._points import Triangulated
 from jaxba.sfm._rays import Rays
 
@@ -137,8 +137,8 @@ def without_edges(tracks: Tracks, matches: MatchRows, pruned: Bool[np.ndarray, "
 
 def edges_to_prune(
     view_graph: ViewGraph, median_px: Float[np.ndarray, " edges"], limit_px: float, photos: Sequence[Photo]
-) -> tuple[dict[int, LeftOut], list[str]]:
-    """Return the edges over the limit with the reason, or none of them and a warning where they are too many.
+) -> tuple[dict[int, PrunedEdge], list[str]]:
+    """Return the edges over the limit with their figures, or none of them and a warning where they are too many.
 
     A wrong edge pulls its two images off, and right edges of theirs go over the limit with it: of those near the limit
     only the worst one at each image is pruned in a round.
@@ -158,13 +158,10 @@ def edges_to_prune(
             continue
         touched |= images
         first, second = (photos[i].name for i in view_graph.pairs[k])
-        pruned[int(k)] = LeftOut(
+        pruned[int(k)] = PrunedEdge(
             name=f"{first}, {second}",
-            reason=f"their {view_graph.num_inliers[k]} matches are off by {_px(float(median_px[k]))} in the median "
-            f"(limit {limit_px:g} px) and were left out; look at both photos for repeated patterns or movement",
+            num_matches=int(view_graph.num_inliers[k]),
+            median_px=float(median_px[k]),
+            limit_px=limit_px,
         )
     return pruned, []
-
-
-def _px(error: float) -> str:
-    return f"{error:.1f} px" if error < 100 else "over 100 px"

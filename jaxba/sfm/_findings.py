@@ -97,7 +97,7 @@ def findings(
         ("Focal length against height", lambda: _focal_and_height(block, sigmas, reference, is_controlled)),
         ("Intrinsics", lambda: _intrinsics(block, start, photos)),
         ("Sigmas of positions", lambda: _positions(block, sigmas, reference, photos, is_controlled)),
-        ("Sigmas", lambda: [Finding.of("note", text=sigmas.why_not)] if sigmas.why_not else []),
+        ("Sigmas", lambda: [Finding.of("no sigmas", text=sigmas.why_not)] if sigmas.why_not else []),
     )
     found: list[Finding] = []
     for what, find in parts:
@@ -129,7 +129,19 @@ def _convergence(adjusted: Adjusted) -> list[Finding]:
 
 
 def _edges(adjusted: Adjusted) -> list[Finding]:
-    return [Finding.of("edge left out", name=left.name, reason=left.reason) for left in adjusted.pruned]
+    """All edges that were left out, the worst first."""
+    if not adjusted.pruned:
+        return []
+    worst_first = sorted(adjusted.pruned, key=lambda edge: -edge.median_px)
+    return [
+        Finding.of(
+            "edges left out",
+            names=[edge.name for edge in worst_first],
+            matches=[edge.num_matches for edge in worst_first],
+            median_px=[edge.median_px for edge in worst_first],
+            limit_px=worst_first[0].limit_px,
+        )
+    ]
 
 
 def _images(adjusted: Adjusted, photos: Sequence[Photo]) -> list[Finding]:

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from pyproj import CRS
+from pyproj import CRS, Proj
 
 from jaxba._errors import JaxbaError
 from jaxba.geo import (
     geodetic_from_local,
+    grid_from_local,
     local_frame,
     local_from_geodetic,
     local_from_projected,
@@ -218,3 +219,34 @@ def test_equal_frames_give_equal_bytes():
     frame = frame_at(-92.0, 46.8, "EPSG:26915")
     local = around(frame)
     assert projected_from_local(frame, local).tobytes() == projected_from_local(replace(frame), local).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("crs", "longitude", "latitude"),
+    [
+        ("EPSG:32615", -92.0, 46.8), ("EPSG:32615", -95.9, 44.9), ("EPSG:32733", 17.2, -33.9),
+        ("EPSG:32633", 12.1, 78.2), ("EPSG:26851", -93.2, 44.9), ("EPSG:2056", 8.5, 47.4),
+        ("EPSG:2154", 5.7, 45.2), ("EPSG:27700", -3.2, 55.9),
+        ("+proj=tmerc +lon_0=9 +datum=WGS84 +units=us-ft", 9.9, 53.5),
+    ],
+)  # fmt: skip
+def test_the_grid_is_turned_by_the_meridian_convergence_and_level_at_each_point(
+    crs: str, longitude: float, latitude: float
+):
+    frame = frame_at(longitude, latitude, crs, datum="ellipsoidal")
+    xyz_m = np.array([[0.0, 0.0, 0.0], [900.0, -400.0, 60.0], [-2000.0, 3000.0, 10.0]])
+    found = grid_from_local(frame, xyz_m)
+    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
+    lon, lat, _ = geodetic_from_local(frame, xyz_m).T
+    gamma = np.radians(Proj(crs).get_factors(lon, lat).meridian_convergence)
+    for k in range(3):
+        lam, phi = np.radians([lon[k], lat[k]])
+        lam0, phi0 = np.radians([frame.longitude_deg, frame.latitude_deg])
+        here, origin = (
+            np.array([[-np.sin(a), np.cos(a), 0], [-np.sin(b) * np.cos(a), -np.sin(b) * np.sin(a), np.cos(b)],
+                      [np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)]])
+            for a, b in ((lam, phi), (lam0, phi0))
+        )  # fmt: skip
+        grid = np.array([[np.cos(gamma[k]), -np.sin(gamma[k]), 0], [np.sin(gamma[k]), np.cos(gamma[k]), 0], [0, 0, 1]])
+        # 1e-5: the angle between the two ellipsoids of WGS 84 and the CRS's datum, and rounding of 1e-9 m over 1 m
+        np.testing.assert_allclose(found[k], grid @ here @ origin.T, rtol=0, atol=1e-5)

@@ -12,6 +12,7 @@ from pyproj import CRS
 
 from jaxba._errors import JaxbaError
 from jaxba.io import CrsText, write_csv_cloud
+from jaxba.io._read_cloud import read_csv_cloud
 
 UTM = CrsText(
     text="EPSG:32615", name="WGS 84 / UTM zone 15N", unit="metre", height_unit="metre", height_note="ellipsoid."
@@ -63,6 +64,20 @@ def test_without_a_crs_the_code_is_empty_and_unknown_sigmas_too(tmp_path: Path):
     note = json.loads((tmp_path / "cloud.csv.json").read_text())
     assert note["EPSG"] is None
     assert "without a place on earth" in note["crs"]
+
+
+@pytest.mark.parametrize("unknown", [(2,), (0, 1), (1,), (0, 1, 2)])
+def test_each_axis_has_its_sigma_where_it_is_known(tmp_path: Path, unknown: tuple[int, ...]):
+    cloud = flown_cloud()
+    std_m = np.tile([0.011, 0.012, 0.013], (cloud.num_points, 1))
+    std_m[3:, list(unknown)] = np.nan
+    write_csv_cloud(tmp_path / "cloud.csv", replace(cloud, std_m=std_m), UTM)
+    table = rows(tmp_path / "cloud.csv")
+    cells = np.array([[row[f"std_{axis}_m"] for axis in "xyz"] for row in table])
+    assert cells[:3].tolist() == [["0.011", "0.012", "0.013"]] * 3
+    for axis, text in enumerate(("0.011", "0.012", "0.013")):
+        assert set(cells[3:, axis]) == {"" if axis in unknown else text}
+    np.testing.assert_array_equal(read_csv_cloud(tmp_path / "cloud.csv").cloud.std_m, std_m)
 
 
 def test_cloud_without_points_is_refused(tmp_path: Path):

@@ -1,5 +1,6 @@
 """Cameras in GeoPackage and GeoJSON as pyogrio, shapely, sqlite3 and json read them."""
 
+import datetime
 import json
 import sqlite3
 from contextlib import closing
@@ -15,8 +16,8 @@ from pyproj import CRS
 from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
-from jaxba.io import CrsText, Sites, make_sites, write_geojson, write_geopackage
-from jaxba.io._sites import attitude_deg, heading_deg
+from jaxba.io import SITE_COLUMNS, CrsText, Sites, make_sites, write_geojson, write_geopackage
+from jaxba.io._sites import attitude_deg, heading_deg, omega_phi_kappa_deg
 from jaxba.scene import Attitude, Reference, cam_from_enu
 
 UTM = CrsText(text="EPSG:32615", name="", unit="metre", height_unit="metre", height_note="Heights: ellipsoidal.")
@@ -37,7 +38,7 @@ def sites() -> Sites:
     residual[2] = np.nan
     return make_sites(
         flown.block, flown.photos, reference, std_m=np.full((6, 3), 0.125), gnss_residual_m=residual,
-        error_px=flown.error_px,
+        error_px=flown.error_px, grid_from_local=np.tile(np.eye(3), (6, 1, 1)),
     )  # fmt: skip
 
 
@@ -77,6 +78,24 @@ def test_unknown_numbers_are_null_and_the_dates_are_fixed(tmp_path: Path):
     assert unknown == [(None, None, None)]
     assert layers == [("cameras", "Heights: ellipsoidal.", "2000-01-01T00:00:00.000Z", 32615)]
     assert pyogrio.get_gdal_config_option("OGR_CURRENT_DATE") is None
+    write_geopackage(tmp_path / "dated.gpkg", made, made.xyz_m + PLACE, UTM, date=datetime.date(2024, 5, 1))
+    with closing(sqlite3.connect(tmp_path / "dated.gpkg")) as base:
+        assert base.execute("select last_change from gpkg_contents").fetchall() == [("2024-05-01T00:00:00.000Z",)]
+
+
+def test_every_column_is_described_and_the_file_is_whole(tmp_path: Path):
+    made = sites()
+    write_geopackage(tmp_path / "cameras.gpkg", made, made.xyz_m + PLACE, UTM)
+    with closing(sqlite3.connect(tmp_path / "cameras.gpkg")) as base:
+        said = base.execute("select column_name, description from gpkg_data_columns").fetchall()
+        columns = [row[1] for row in base.execute("pragma table_info(cameras)")]
+        extensions = {row[0] for row in base.execute("select extension_name from gpkg_extensions")}
+        assert base.execute("pragma integrity_check").fetchall() == [("ok",)]
+    assert dict(said) == SITE_COLUMNS and [name for name, _ in said] == columns[2:]  # after fid and geom
+    assert "gpkg_schema" in extensions and list(table(tmp_path / "cameras.gpkg")[1]) == list(SITE_COLUMNS)
+    for name, meaning in said:
+        unit = {"m": "metres", "deg": "degrees", "px": "pixels"}.get(name.rsplit("_", 1)[-1])
+        assert unit is None or unit in meaning, name
 
 
 def test_same_cameras_give_the_same_bytes(tmp_path: Path):
@@ -137,3 +156,34 @@ def test_heading_is_yaw_without_roll_and_steady_straight_down(pitch: float):
         assert heading_deg(rotation[None])[0] == pytest.approx(yaw, abs=1e-9)
         leaning = Rotation.from_rotvec([0, np.radians(1), 0]).as_matrix() @ rotation
         assert heading_deg(leaning[None])[0] == pytest.approx(yaw, abs=1.5)
+
+
+def test_omega_phi_kappa_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    angles = np.concatenate([rng.uniform(-180, 180, (50, 3)) * [1, 0.49, 1], rng.normal(0, 2, (50, 3)) * [1, 1, 90]])
+    wanted = Rotation.from_euler("XYZ", angles, degrees=True)  # Rx(omega) Ry(phi) Rz(kappa)
+    photo_from_cam = np.diag([1.0, -1.0, -1.0])
+    found = omega_phi_kappa_deg(wanted.as_matrix() @ photo_from_cam)
+    np.testing.assert_allclose(found, wanted.as_euler("XYZ", degrees=True), atol=1e-9)
+
+
+@pytest.mark.parametrize("phi", [-90.0, 90.0])
+@pytest.mark.parametrize("kappa", [-170.0, -20.0, 0.0, 95.0])
+def test_a_photo_that_looks_along_the_grids_x_axis_has_angles_that_make_its_rotation(phi: float, kappa: float):
+    wanted = Rotation.from_euler("XYZ", [0.0, phi, kappa], degrees=True).as_matrix()
+    found = omega_phi_kappa_deg((wanted @ np.diag([1.0, -1.0, -1.0]))[None])[0]
+    assert found[0] == 0.0
+    again = Rotation.from_euler("XYZ", found, degrees=True).as_matrix()
+    np.testing.assert_allclose(again, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("heading", [0.0, 63.0, 90.0, 200.0, 355.0])
+def test_along_a_strip_that_looks_down_omega_and_phi_are_small_and_kappa_is_steady(heading: float):
+    """Leaning by a degree to any side, where yaw and roll jump by tens of degrees."""
+    down = cam_from_enu(Attitude(yaw_deg=heading, pitch_deg=-90.0, roll_deg=0.0))
+    leaning = Rotation.from_rotvec(np.random.default_rng(1).uniform(-1, 1, (40, 3)) * [1, 1, 0.2], degrees=True)
+    cam_from_world = leaning.as_matrix() @ down
+    omega, phi, kappa = omega_phi_kappa_deg(np.swapaxes(cam_from_world, 1, 2)).T
+    assert np.abs(omega).max() < 1.5 and np.abs(phi).max() < 1.5
+    turned = (kappa + heading + 180) % 360 - 180  # kappa counts anticlockwise
+    assert np.abs(turned).max() < 0.5 and np.ptp(attitude_deg(cam_from_world)[:, 0]) > 90

@@ -1,5 +1,6 @@
 """LAS and LAZ as laspy reads them: CRS, millimetres, colours."""
 
+import datetime
 from pathlib import Path
 
 import laspy
@@ -71,7 +72,16 @@ def test_same_cloud_gives_the_same_bytes(tmp_path: Path):
     for name in ("a.laz", "b.laz"):
         write_las(tmp_path / name, flown_cloud(UTM), crs_text("EPSG:32615"))
     assert (tmp_path / "a.laz").read_bytes() == (tmp_path / "b.laz").read_bytes()
-    assert laspy.read(tmp_path / "a.laz").header.creation_date.isoformat() == "2000-01-01"
+
+
+@pytest.mark.parametrize("date", [None, datetime.date(2024, 2, 29), datetime.date(2025, 12, 31)])
+@pytest.mark.parametrize("name", ["cloud.las", "cloud.laz"])
+def test_the_date_is_that_of_the_flight_or_none(tmp_path: Path, name: str, date: datetime.date | None):
+    write_las(tmp_path / name, flown_cloud(UTM), crs_text("EPSG:32615"), date=date)
+    las = laspy.read(tmp_path / name)
+    assert las.header.creation_date == date and len(las.points) == flown_cloud().num_points
+    if date is None:
+        assert (tmp_path / name).read_bytes()[90:94] == bytes(4)
 
 
 def test_cloud_that_millimetres_cannot_hold_is_refused(tmp_path: Path):

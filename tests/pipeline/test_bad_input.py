@@ -123,6 +123,39 @@ def test_a_folder_without_photos_is_refused(tmp_path: Path, make, message: str):
     make(tmp_path / "photos")
     with pytest.raises(JaxbaError, match=message):
         Survey(tmp_path / "photos", tmp_path / "project").run(until="metadata")
+    assert not (tmp_path / "project").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "gcp"),
+    [
+        ("crs.target_crs=EPSG:99999", None),
+        ("crs.target_crs=EPSG:4326", None),
+        ("crs.target_crs=EPSG:32715", None),
+        ("crs.target_crs=UTM 15", None),
+        ("crs.target_crs=EPSG:32615", "gone.txt"),
+        ("crs.target_crs=EPSG:32615", "empty.txt"),
+    ],
+)
+@pytest.mark.parametrize("there", ["nothing", "an empty folder", "a file beside it", "a project"])
+def test_what_is_refused_leaves_no_new_project(photos: Path, tmp_path: Path, change: str, gcp: str | None, there: str):
+    (tmp_path / "empty.txt").write_text("EPSG:32615\n")
+    project = tmp_path / "surveys" / "project"
+    if there == "an empty folder":
+        project.mkdir(parents=True)
+    if there == "a file beside it":
+        project.parent.mkdir()
+        (project.parent / "notes.txt").touch()
+    if there == "a project":
+        Survey(photos, project).run(until="metadata")
+    before = sorted(path.relative_to(tmp_path) for path in (tmp_path / "surveys").rglob("*"))
+    with pytest.raises(JaxbaError):
+        Survey(photos, project).run(change, gcp=None if gcp is None else tmp_path / gcp, until="pairs")
+    after = sorted(path.relative_to(tmp_path) for path in (tmp_path / "surveys").rglob("*"))
+    if there == "a project":
+        assert set(before) <= set(after)  # its records stay
+    else:
+        assert after == before and (tmp_path / "surveys").exists() == (there != "nothing")
 
 
 @pytest.mark.parametrize("has_position", [True, False])

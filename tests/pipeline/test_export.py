@@ -1,11 +1,13 @@
 """The exports of an adjusted block: the same place on earth in every file, whole files, the same bytes."""
 
 import contextlib
+import csv
 import json
 import os
 import resource
 from collections.abc import Iterator
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 
 import laspy
@@ -18,11 +20,13 @@ from PIL import Image
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
+from jaxba import geo
 from jaxba._errors import JaxbaError
-from jaxba.io import read_tile
+from jaxba.io import CLOUD_COLUMNS, CONTROL_COLUMNS, SITE_COLUMNS, read_tile
 from jaxba.pipeline import adjust, crs, export
-from jaxba.scene import LeftOut, Photo, Position, Reference
+from jaxba.scene import Control, ControlFit, LeftOut, Photo, Position, Reference
 
+OPK = ("omega", "phi", "kappa")
 LON, LAT, HEIGHT = -92.0, 46.8, 198.0
 FILES = {
     "README.txt", "cameras.geojson", "cameras.gpkg", "cloud.csv", "cloud.csv.json", "cloud.laz", "cloud.ply",
@@ -99,9 +103,14 @@ def test_every_file_is_there_and_named(exported):
     assert all((given.folder / name).stat().st_size > 0 for name in outputs.files)
     assert any("EPSG:32615" in note and given.reference.frame.height_note in note for note in outputs.notes)
     assert any("line 2/späte Aufnahme.JPG" in note for note in outputs.notes)
-    readme = (given.folder / "README.txt").read_text(encoding="utf-8")
+    text = (given.folder / "README.txt").read_text(encoding="utf-8")
+    readme = " ".join(text.split())
     assert all(note in readme for note in outputs.notes)
     assert all(name.split("/")[0] in readme for name in outputs.files if name != "README.txt")
+    for name, meaning in {**CLOUD_COLUMNS, **SITE_COLUMNS}.items():
+        assert f" {name} {meaning}" in readme
+    assert "R = Rx(omega) Ry(phi) Rz(kappa)" in readme and "Grid north lies 0.7290 degrees clockwise" in readme
+    assert "control.csv" not in readme and max(map(len, text.splitlines())) <= 120
 
 
 def test_clouds_are_in_the_target_crs_point_by_point(exported):
@@ -133,6 +142,27 @@ def test_cameras_lie_in_both_files_at_one_place(exported):
         np.testing.assert_allclose([found[n] for n in names], expected, rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize("target", ["EPSG:32615", "EPSG:26849"])
+def test_omega_phi_kappa_are_those_of_the_cameras_axes_in_the_grid(tmp_path: Path, target: str):
+    """The tips of each camera's axes go point by point through earth-centred coordinates into the grid."""
+    given = inputs(tmp_path / "a", target)
+    export.run(given, export.Params())
+    block, frame = given.adjusted.block, given.reference.frame
+    _, _, _, columns = pyogrio.raw.read(tmp_path / "a" / "cameras.gpkg")
+    fields = list(SITE_COLUMNS)
+    rows = {name: k for k, name in enumerate(columns[0])}
+    unit_m = CRS(target).axis_info[0].unit_conversion_factor
+    axes = Rotation.from_quat(block.quaternion, scalar_first=True).as_matrix() * np.array([1, -1, -1])[:, None]
+    for row, index in enumerate(block.image_index):
+        ends = block.centers_m[row] + 0.5 * np.concatenate([axes[row], -axes[row]])  # right, top, backwards
+        there = ellipsoidal_from_local(frame, ends, target) * [unit_m, unit_m, 1]
+        dense = (there[:3] - there[3:]).T
+        dense[:2] /= np.sqrt(abs(np.linalg.det(dense)))  # the grid's scale
+        found = [columns[fields.index(f"{angle}_deg")][rows[given.photos[index].name]] for angle in OPK]
+        again = Rotation.from_euler("XYZ", found, degrees=True).as_matrix()
+        np.testing.assert_allclose(again, dense, rtol=0, atol=2e-6)  # coordinates of 5e6 m are rounded to 1e-9 m
+
+
 @pytest.mark.parametrize("target", ["EPSG:26849", "EPSG:6344"])
 def test_feet_and_other_datums_are_those_of_the_crs(tmp_path: Path, target: str):
     given = inputs(tmp_path / "a", target)
@@ -144,6 +174,72 @@ def test_feet_and_other_datums_are_those_of_the_crs(tmp_path: Path, target: str)
     scale = CRS(target).axis_info[0].unit_conversion_factor
     # 2.5 m: what WGS 84 and NAD83 may be apart, by the operation chosen
     assert np.abs(las.xyz[:, :2] - expected[:, :2]).max() * scale < 2.5
+
+
+def surveyed(given: export.Inputs, *, horizontal_only: bool) -> export.Inputs:
+    """Five points, two of them check points, of which the last is not marked, beside the block's own."""
+    block, rng = given.adjusted.block, np.random.default_rng(1)
+    std_m = np.full((5, 3), 0.02)
+    off_m = rng.normal(0, 0.3, (5, 3))
+    points_std_m = np.full((block.num_points, 3), 0.01)
+    fit = replace(
+        ControlFit.nothing(5), adjusted_m=block.points_m[:5] + off_m, residual_m=off_m, std_m=std_m.copy(),
+        num_marks=np.array([2, 3, 4, 5, 1]), method="adjust",
+    )  # fmt: skip
+    fit.adjusted_m[4], fit.residual_m[4], fit.std_m[4] = np.nan, np.nan, np.nan
+    if horizontal_only:
+        std_m[:, 2], fit.residual_m[:, 2], fit.std_m[:, 2], points_std_m[:, 2] = np.inf, np.nan, np.nan, np.nan
+    control = replace(
+        Control.nothing(), names=("g 1", "g2", "g3", "c1", "c2"), xyz_m=block.points_m[:5], std_m=std_m,
+        is_check=np.array([False, False, False, True, True]),
+    )  # fmt: skip
+    adjusted = replace(given.adjusted, control=fit, point_std_m=points_std_m)
+    return replace(given, control=control, adjusted=adjusted)
+
+
+@pytest.mark.parametrize("horizontal_only", [False, True])
+@pytest.mark.parametrize("target", ["EPSG:32615", "EPSG:26849", "EPSG:6344"])
+def test_residuals_of_control_are_the_differences_of_its_coordinates(
+    tmp_path: Path, target: str, horizontal_only: bool
+):
+    given = surveyed(inputs(tmp_path / "a", target), horizontal_only=horizontal_only)
+    export.run(given, export.Params())
+    with open(tmp_path / "a" / "control.csv", encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == list(CONTROL_COLUMNS)
+    turn = geo.grid_from_local(given.reference.frame, given.control.xyz_m)
+    unit_m = CRS(target).axis_info[0].unit_conversion_factor
+    for k, row in enumerate(rows[:4]):
+        for axis in "xyz"[: 2 if horizontal_only else 3]:
+            adjusted, before = Decimal(row[f"adjusted_{axis}"]), Decimal(row[f"surveyed_{axis}"])
+            assert adjusted - before == Decimal(row[f"residual_{axis}"])
+        true = np.array([float(row[f"residual_true_{axis}_m"] or 0) for axis in ("east", "north", "up")])
+        grid = unit_m * np.array([float(row["residual_x"]), float(row["residual_y"])])
+        scale = np.linalg.norm(grid) / np.linalg.norm((turn[k] @ true)[:2])
+        np.testing.assert_allclose(grid, scale * (turn[k] @ true)[:2], rtol=0, atol=2e-4)  # of four decimals each
+        assert abs(scale - 1) < 2e-3
+        assert (row["std_up_m"], row["residual_z"], row["surveyed_z"]) == ("", "", "") or not horizontal_only
+        assert row["reason"] == (
+            "no surveyed height; no sigma up: nothing measured holds heights" if horizontal_only else ""
+        )
+    assert rows[4]["adjusted_x"] == "" and rows[4]["reason"].endswith("used marks in fewer than two adjusted photos")
+    text = " ".join((tmp_path / "a" / "README.txt").read_text(encoding="utf-8").split())
+    assert all(f" {name} {meaning}" in text for name, meaning in CONTROL_COLUMNS.items())
+    assert ("points have no sigma up: nothing measured holds heights" in text) == horizontal_only
+
+
+@pytest.mark.parametrize(
+    ("times", "day"),
+    [
+        (["2024-05-01T10:00:00", "2024-05-02T00:10:00"], "2024-05-02"),
+        ([None, "2023-12-31T23:59:59.25+02:00"], "2023-12-31"),
+        ([None, None], None),
+    ],
+)
+def test_files_are_dated_by_the_last_photo(times: list[str | None], day: str | None):
+    photos = [replace(flown_block().photos[0], time=time) for time in times]
+    found = export._flight_date(photos)
+    assert (None if found is None else found.isoformat()) == day
 
 
 def test_same_inputs_give_the_same_bytes(exported, tmp_path: Path):

@@ -183,7 +183,7 @@ def test_what_was_decided_on_each_pair_is_kept_with_its_figures(frames: list[Fea
     assert record.fallback.tolist() == [Fallback.NONE] * 3
     lines = pair_lines(graph, record)
     assert lines[0] == "RANSAC threshold 3 px on 2 pairs, 2 px on 1 pair."
-    assert any(line.startswith("Rejected (match.min_inliers): 1 pair with") for line in lines)
+    assert any(line.startswith("No overlap, or none found (match.min_inliers): 1 pair with") for line in lines)
     assert pair_facts(graph, record)["thresholds_px"] == {"2": 1, "3": 2}
     unknown = match.run(inputs_of(frames[:2], focal_px=None), match.Params()).record
     assert unknown.model.tolist()[0] in (Model.FUNDAMENTAL, Model.HOMOGRAPHY)
@@ -198,7 +198,7 @@ def test_weak_pairs_are_counted_by_the_figure_that_they_miss(frames: list[Featur
         num_verified=np.array([29, 100, 0], np.int32),
     )
     assert pair_lines(graph, record)[-2:] == [
-        "Rejected (match.min_inliers): 1 pair with 9 matches before verification.",
+        "No overlap, or none found (match.min_inliers): 1 pair with 9 matches before verification.",
         "Weak: 1 pair with 29 verified matches (match.min_good), 1 pair with 25% of the matches verified "
         "(match.min_inlier_ratio).",
     ]

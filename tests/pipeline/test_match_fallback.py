@@ -105,7 +105,7 @@ def test_fine_or_unknown_ground_sample_distance_rejects_the_pair(
         "1 pair too fine for SIFT, 2 cm/px (match.fallback_gsd)" if height_m == 10 else "1 pair without a known ground"
     )
     assert why in lines[-1] and "1 of these are rejected" in lines[-1]
-    assert "Rejected (match.min_inliers): 1 pair with" in lines[-2]
+    assert "No overlap, or none found (match.min_inliers): 1 pair with" in lines[-2]
 
 
 def test_the_limit_is_a_parameter(photos: tuple[Photo, ...], orb: dict[int, Features]) -> None:

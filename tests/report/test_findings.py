@@ -4,12 +4,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxba
 from jaxba.engine._key import Key
 from jaxba.engine._store import load, save
-from jaxba.report import sentence
+from jaxba.report import is_to_act_on, sentence
 from jaxba.report._findings import WORDS
 from jaxba.scene import Finding
 
@@ -18,6 +19,10 @@ CASES = [
     (
         Finding.of("note", text="A note."),
         "A note.",
+    ),
+    (
+        Finding.of("no sigmas", text="Sigmas were not computed."),
+        "Sigmas were not computed.",
     ),
     (
         Finding.of("not settled", medians_px=[1.0, 0.8, 0.55]),
@@ -34,8 +39,29 @@ CASES = [
         "cameras or zooms are mixed.",
     ),
     (
-        Finding.of("edge left out", name="a, b", reason="off"),
-        "Edge left out: a, b: off.",
+        Finding.of("edges left out", names=["a, b"], matches=[60], median_px=[5.12], limit_px=3.0),
+        "1 edge was left out, since its matches are off by over 3 px in the median. Look at its photos for "
+        "repeated patterns or movement.\n     5.1 px     60 matches  a, b",
+    ),
+    (
+        Finding.of(
+            "edges left out",
+            names=[f"p{i}, q{i}" for i in range(13)],
+            matches=[1200] + [45] * 12,
+            median_px=[812.0, *np.linspace(40, 3.1, 12).tolist()],
+            limit_px=3.0,
+        ),
+        "13 edges were left out, since their matches are off by over 3 px in the median. Look at photos of the "
+        "worst for repeated patterns or movement.\n"
+        "   812.0 px   1200 matches  p0, q0\n"
+        "    40.0 px     45 matches  p1, q1\n"
+        "    36.6 px     45 matches  p2, q2\n"
+        "    33.3 px     45 matches  p3, q3\n"
+        "    29.9 px     45 matches  p4, q4\n"
+        "    26.6 px     45 matches  p5, q5\n"
+        "    23.2 px     45 matches  p6, q6\n"
+        "    19.9 px     45 matches  p7, q7\n"
+        "  and 5 more: summary.json, adjust.edges_left_out",
     ),
     (
         Finding.of("image lost", name="a", reason="off"),
@@ -52,8 +78,15 @@ CASES = [
     ),
     (
         Finding.of("positions contradict", names=["a"], residual_m=[[-2.0, 0.04, NAN]], measured=12, sigmas=3.0),
-        "1 measured position of 12 contradict the photos by more than 3 robust sigmas and hardly count (adjusted "
-        "minus measured, east, north, up): a (-2.0, +0.0, none m).",
+        "1 measured position of 12 contradicts the photos by more than 3 robust sigmas and hardly counts (adjusted "
+        "minus measured): a (east -2.0, north +0.0 m).",
+    ),
+    (
+        Finding.of(
+            "positions contradict", names=["a", "b"], residual_m=[[-2.0, 0.04, 9.0], [5.0] * 3], measured=12, sigmas=3.0
+        ),
+        "2 measured positions of 12 contradict the photos by more than 3 robust sigmas and hardly count (adjusted "
+        "minus measured): a (east -2.0, north +0.0, up +9.0 m), b (east +5.0, north +5.0, up +5.0 m).",
     ),
     (
         Finding.of("positions scatter", axes=["east", "up"], scale_m=[0.2, 1.0], stated_m=[0.03, 0.06]),
@@ -108,8 +141,7 @@ CASES = [
             above_ground_m=46.0,
             above_take_off_m=50.0,
         ),
-        "Focal length and height trade off (all photos look straight down from one height): fx is 1000.0 px with "
-        "a sigma of nan px (nan%), which alone makes the height above ground of 50.0 m uncertain by nan m. The "
+        "Focal length and height trade off (all photos look straight down from one height): fx is 1000.0 px. The "
         "cameras are 46.0 m above the ground points by the adjustment and 50.0 m above the take-off point by the "
         "flight's own record (-8%); a focal length of 1087 px would agree with it, if the ground lies at the "
         "height of the take-off point. Hold the focal length at a calibrated value (metadata.focal), fly a second"
@@ -203,7 +235,7 @@ CASES = [
             limit=3.29,
             method="adjust",
         ),
-        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, none m east, north, up, "
+        "Control point g1 contradicts the block: adjusted minus surveyed east +0.500, north -0.100 m, "
         "9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name and "
         "its marks. It pulls the block no harder than a point that is off by 3 sigmas; make it a check point "
         "(control.check) to leave it out.",
@@ -218,7 +250,7 @@ CASES = [
             limit=3.29,
             method="adjust",
         ),
-        "Check point c1 contradicts the block: adjusted minus surveyed +0.500, -0.100, +2.000 m east, north, up, "
+        "Check point c1 contradicts the block: adjusted minus surveyed east +0.500, north -0.100, up +2.000 m, "
         "9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name and "
         "its marks.",
     ),
@@ -232,8 +264,8 @@ CASES = [
             limit=3.29,
             method="helmert",
         ),
-        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, +2.000 m east, north, "
-        "up, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
+        "Control point g1 contradicts the block: adjusted minus surveyed east +0.500, north -0.100, up +2.000 "
+        "m, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
         "and its marks. It was left out of the fit where others remained.",
     ),
     (
@@ -246,8 +278,8 @@ CASES = [
             limit=3.29,
             method="affine",
         ),
-        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, +2.000 m east, north, "
-        "up, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
+        "Control point g1 contradicts the block: adjusted minus surveyed east +0.500, north -0.100, up +2.000 "
+        "m, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
         "and its marks. It was left out of the fit where others remained.",
     ),
     (
@@ -260,21 +292,21 @@ CASES = [
             limit=3.29,
             method="none",
         ),
-        "Control point g1 contradicts the block: adjusted minus surveyed +0.500, -0.100, +2.000 m east, north, "
-        "up, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
+        "Control point g1 contradicts the block: adjusted minus surveyed east +0.500, north -0.100, up +2.000 "
+        "m, 9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name "
         "and its marks.",
     ),
     (
         Finding.of("gnss off control", offset_m=[1.5, -2.0, NAN], std_m=[0.03, 0.03, 0.06], is_compared=False),
-        "GNSS positions minus the block as control places it: +1.50, -2.00, unknown m east, north, up, for all "
-        "photos in common, with sigmas of 0.03, 0.03, 0.06 m; the block follows control. Decimetres are the "
+        "GNSS positions minus the block as control places it: east +1.50, north -2.00 m, for all "
+        "photos in common, with sigmas of east 0.03, north 0.03 m; the block follows control. Decimetres are the "
         "antenna's offset; metres and tens of metres two datums or height systems; hundreds a wrong zone or "
         "swapped axes of one of the two.",
     ),
     (
         Finding.of("gnss off control", offset_m=[1.5, -2.0, 31.0], std_m=[3.0, 3.0, INF], is_compared=True),
-        "GNSS positions minus the block as control places it: +1.50, -2.00, +31.00 m east, north, up, for all "
-        "photos in common, with sigmas of 3, 3, inf m; compared only. Decimetres are the antenna's offset; metres"
+        "GNSS positions minus the block as control places it: east +1.50, north -2.00, up +31.00 m, for all "
+        "photos in common, with sigmas of east 3, north 3 m; compared only. Decimetres are the antenna's offset; metres"
         " and tens of metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the "
         "two.",
     ),
@@ -289,6 +321,16 @@ class Kept:
 @pytest.mark.parametrize(("finding", "words"), CASES, ids=[finding.kind for finding, _ in CASES])
 def test_a_finding_is_told_with_its_figures(finding: Finding, words: str):
     assert sentence(finding) == words
+
+
+@pytest.mark.parametrize(("finding", "words"), CASES, ids=[finding.kind for finding, _ in CASES])
+def test_what_is_not_known_is_left_out_of_a_sentence(finding: Finding, words: str):
+    assert not re.search(r"\b(nan|inf|none|None)\b", sentence(finding))
+
+
+def test_what_was_done_is_told_apart_from_what_asks_for_something():
+    kinds = {finding.kind for finding, _ in CASES if not is_to_act_on(finding)}
+    assert kinds == {"edges left out", "common offset"}
 
 
 def test_more_than_ten_photos_are_counted():

@@ -120,6 +120,13 @@ def test_failed_photos_and_rejected_pairs_are_listed(made: Survey, tmp_path: Pat
     others = [f"SIM_0002.JPG, SIM_{number:04d}.JPG" for number in range(3, NUM_PHOTOS + 1)]
     assert [left.name for left in found.rejected] == others
     assert all(left.reason.endswith("matches, too few of them verified") for left in found.rejected)
+    assert found.num_pairs == (NUM_PHOTOS - 1) * (NUM_PHOTOS - 2) // 2
+    shown = subprocess.run(
+        [sys.executable, "-m", "jaxba", "status", str(survey.project)], capture_output=True, text=True
+    )
+    edges = found.num_pairs - len(found.rejected)
+    said = f"pairs {edges} of {found.num_pairs} candidate pairs became edges; the others are mostly photos that do not"
+    assert said in " ".join(shown.stdout.split()) and "rejected" not in shown.stdout
 
 
 def test_a_folder_that_is_no_project_is_refused(tmp_path: Path):

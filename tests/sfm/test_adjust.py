@@ -131,8 +131,9 @@ def test_a_wrong_edge_is_pruned_and_named(
     adjusted_hard: Adjusted, hard_and_edge: tuple[Simulated, tuple[int, int]]
 ) -> None:
     first, second = hard_and_edge[1]
-    named = {left.name: left.reason for left in adjusted_hard.pruned}
-    assert "px in the median" in named[f"DJI_{first:04d}.JPG, DJI_{second:04d}.JPG"]
+    named = {edge.name: edge for edge in adjusted_hard.pruned}
+    found = named[f"DJI_{first:04d}.JPG, DJI_{second:04d}.JPG"]
+    assert found.median_px > found.limit_px == 3.0 and found.num_matches > 0
     assert len(named) <= 2  # an edge of a handful of matches may be wrong features for the most part
 
 

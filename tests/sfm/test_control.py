@@ -210,6 +210,28 @@ def test_horizontal_control_leaves_heights_to_gnss(survey: Simulated, points: Co
     assert abs(up) < 3.0  # GNSS of 5 m, 12 of them
 
 
+@pytest.mark.parametrize("method", ["adjust", "helmert", "affine", "none"])
+@pytest.mark.parametrize("unknown", [[], [2], [0, 1, 2]])
+@pytest.mark.parametrize("has_heights", [True, False])
+def test_points_have_no_sigma_along_an_axis_that_nothing_measured_holds(
+    survey: Simulated,
+    points: Control,
+    made: tuple[Adjusted, Controlled],
+    method: str,
+    unknown: list[int],
+    has_heights: bool,
+) -> None:
+    sigmas = uncertainty_of(made[0], survey.reference)
+    point_std_m = sigmas.point_std_m.copy()
+    point_std_m[:, unknown] = np.nan
+    control = replace(points if has_heights else without_heights(points), method=method)
+    found = apply_control(made[0], replace(sigmas, point_std_m=point_std_m), control, survey.reference).fit
+    held = ~np.isin(np.arange(3), unknown)
+    if method in ("helmert", "affine"):  # the fit itself holds what control has
+        held = np.array([True, True, held[2] or has_heights])
+    assert np.array_equal(np.isfinite(found.std_m), np.tile(held, (10, 1)))
+
+
 def test_points_and_marks_stand_behind_the_blocks_own(survey: Simulated, points: Control) -> None:
     block = with_points(survey.block, survey.tracks, min_angle_rad=0.02, max_error_px=20.0)
     part = control_part(block, points, np.ones(len(points.mark_point), bool))

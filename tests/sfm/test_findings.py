@@ -9,7 +9,7 @@ import pytest
 from simulated import Simulated, simulate, true_block
 
 from jaxba.report import sentences
-from jaxba.scene import Block, Finding, LeftOut, Reference
+from jaxba.scene import Block, Finding, LeftOut, PrunedEdge, Reference
 from jaxba.sfm import Adjusted, Settings, Uncertainty, adjust, findings, gnss_fit, height_above_ground, with_points
 
 
@@ -147,11 +147,16 @@ def test_images_with_few_points_are_named(adjusted: Adjusted, survey: Simulated)
 def test_what_the_rounds_left_out_is_told(adjusted: Adjusted, survey: Simulated) -> None:
     left = replace(
         adjusted,
-        pruned=(LeftOut(name="a.jpg, b.jpg", reason="their 60 matches are off by 5.1 px"),),
+        pruned=(
+            PrunedEdge(name="a.jpg, b.jpg", num_matches=60, median_px=5.1, limit_px=3.0),
+            PrunedEdge(name="b.jpg, c.jpg", num_matches=45, median_px=9.2, limit_px=3.0),
+        ),
         lost=(LeftOut(name="c.jpg", reason="fewer than 3 of its features fit"),),
     )
     found = _findings(left, survey)
-    assert found["edge left out"] == {"name": "a.jpg, b.jpg", "reason": "their 60 matches are off by 5.1 px"}
+    assert found["edges left out"] == {
+        "names": ["b.jpg, c.jpg", "a.jpg, b.jpg"], "matches": [45, 60], "median_px": [9.2, 5.1], "limit_px": 3.0,
+    }  # fmt: skip
     assert found["image lost"] == {"name": "c.jpg", "reason": "fewer than 3 of its features fit"}
 
 

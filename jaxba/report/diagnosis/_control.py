@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxba.engine._words import some
+from jaxba.report._control_findings import along_axes
 from jaxba.report._recorded import Recorded
 from jaxba.report.diagnosis._adjustment import has_large_errors
 from jaxba.report.diagnosis._diagnosis import Diagnosis
@@ -27,7 +28,8 @@ def poor_control(case: Recorded) -> Diagnosis | None:
         f"{name} ({over:.1f} sigmas)"
         for name, over in zip(names[fit.is_suspect], fit.over_sigma[fit.is_suspect], strict=True)
     ]
-    expected = np.nanmedian(np.hypot(fit.std_m[known], control.std_m[known]), axis=0)
+    std_m = np.hypot(fit.std_m[known], control.std_m[known])
+    expected = [np.median(std[np.isfinite(std)]) if np.isfinite(std).any() else np.nan for std in std_m.T]
     poor = []
     for role, rms in (("control", fit.control_rms_m), ("check", fit.check_rms_m)):
         for axis, value, limit in zip(("east", "north", "up"), rms, expected, strict=True):
@@ -38,7 +40,7 @@ def poor_control(case: Recorded) -> Diagnosis | None:
     used = ~control.is_check & known
     spread = _spread(case, used)
     texts = [
-        f"Residuals (RMS east, north, up): control {_axes(fit.control_rms_m)}, check {_axes(fit.check_rms_m)}",
+        f"Residuals (RMS): control {_axes(fit.control_rms_m)}, check {_axes(fit.check_rms_m)}",
         f"too large: {'; '.join(poor)}" if poor else "",
         f"blunder test: {some(suspects)}" if suspects else "the blunder test names none",
         f"sigmas of control were enlarged {fit.scale.max():.1f} times" if (fit.scale > 1).any() else "",
@@ -62,8 +64,7 @@ def poor_control(case: Recorded) -> Diagnosis | None:
 
 
 def _axes(rms: np.ndarray) -> str:
-    known = ", ".join("unknown" if np.isnan(value) else f"{value:.3f}" for value in rms)
-    return f"{known} m" if np.isfinite(rms).any() else "none"
+    return along_axes(rms.tolist(), ".3f") if np.isfinite(rms).any() else "none"
 
 
 def _spread(case: Recorded, used: np.ndarray) -> float:

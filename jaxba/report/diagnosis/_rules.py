@@ -44,7 +44,11 @@ def diagnose(folder: Path, pipeline: Pipeline) -> list[Diagnosis]:
 
     Raises `JaxbaError` where the folder is no project.
     """
-    case = recorded(folder, pipeline)
+    return diagnoses(recorded(folder, pipeline))
+
+
+def diagnoses(case: Recorded) -> list[Diagnosis]:
+    """Return what looks poor by what the stages recorded, beside the findings of the adjustment."""
     found = [diagnosis for rule in RULES if (diagnosis := rule(case)) is not None]
     said = limits.stopped(case)
     return [*found, said] if said is not None else found

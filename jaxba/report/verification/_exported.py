@@ -123,11 +123,11 @@ def _expect_keys(path: Path, found: Any, expected: Sequence[str], place: str) ->
 
 
 def _description(path: Path) -> dict[str, Any]:
-    from jaxba.io._csv_cloud import COLUMNS
+    from jaxba.io import CLOUD_COLUMNS
 
     content = _json(path)
     _expect_keys(path, content, _DESCRIBED, "field")
-    _expect_keys(path, content["columns"], tuple(COLUMNS), "column")
+    _expect_keys(path, content["columns"], tuple(CLOUD_COLUMNS), "column")
     if type(content["points"]) is not int:
         raise JaxbaError(f"{path}: field points is {content['points']!r}, not a whole number; {_CURE}.")
     return content
@@ -164,11 +164,11 @@ def _opensfm(path: Path) -> dict[str, Any]:
 
 def _control(path: Path) -> list[dict[str, str]]:
     """Return the rows of the surveyed points; a cell is a number, or empty where nothing is known."""
-    from jaxba.io._csv_control import CONTROL_COLUMNS
+    from jaxba.io import CONTROL_COLUMNS
 
     with open(path, encoding="utf-8-sig", newline="") as file:
         header, *rows = list(csv.reader(file)) or [[]]
-    _expect_keys(path, dict.fromkeys(header), CONTROL_COLUMNS, "column")
+    _expect_keys(path, dict.fromkeys(header), tuple(CONTROL_COLUMNS), "column")
     table = []
     for number, row in enumerate(rows, 2):
         if len(row) != len(header):
@@ -176,7 +176,7 @@ def _control(path: Path) -> list[dict[str, str]]:
         cells = dict(zip(header, row, strict=True))
         if cells["role"] not in ("control", "check"):
             raise JaxbaError(f"{path}, line {number}: role is {cells['role']!r}, not control or check; {_CURE}.")
-        for name in header[2:-1]:
+        for name in header[2:-2]:
             _number(path, number, name, cells[name])
         table.append(cells)
     return table
@@ -209,13 +209,13 @@ _READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Any], str]]] = {
     DESCRIPTION: (_description, lambda found: f"{len(found['columns'])} columns described, {found['points']:,} points"),
     "cloud.ply": (_clouds("read_ply"), _cloud_figure("9 properties")),
     "cloud.laz": (_clouds("read_las"), _cloud_figure("LAS 1.4, point format 7, 3 extra dimensions")),
-    "cameras.gpkg": (_sites, lambda found: f"layer cameras, 16 columns, {len(found.name):,} photos"),
-    "cameras.geojson": (_sites, lambda found: f"16 columns, {len(found.name):,} photos"),
+    "cameras.gpkg": (_sites, lambda found: f"layer cameras, 19 columns, {len(found.name):,} photos"),
+    "cameras.geojson": (_sites, lambda found: f"19 columns, {len(found.name):,} photos"),
     TEXT: (_model, _model_figure),
     BINARY: (_binary, lambda found: f"{found.num_images:,} images, {found.num_points:,} points"),
     FRAME: (_frame, lambda found: "no place on earth" if found is None else f"origin and {found.crs}"),
     OPENSFM: (_opensfm, lambda found: f"{len(found['shots']):,} shots, {len(found['points']):,} points"),
-    CONTROL: (_control, lambda found: f"18 columns, {len(found):,} control and check points"),
+    CONTROL: (_control, lambda found: f"22 columns, {len(found):,} control and check points"),
     TILE: (_tile, lambda found: f"{found.num_images:,} images, {found.num_points:,} points"),
 }
 """How each file, or folder of files, is read, and its figure."""

@@ -30,6 +30,7 @@ from jaxba.report.verification._exported import (
     Exported,
     read_export,
 )
+from jaxba.scene import Finding
 
 if TYPE_CHECKING:
     from jaxba.ba import Problem
@@ -76,6 +77,12 @@ def verify(folder: Path, pipeline: Pipeline, params: Params) -> list[Check]:
         _inliers(adjusted, params),
         *place_checks(project, pipeline, exported, _moved_m(adjusted)),
     ]
+
+
+def exported_findings(folder: Path, pipeline: Pipeline) -> tuple[Finding, ...]:
+    """Return what the adjustment found of the block that was exported; none where its record is gone."""
+    record = Project(folder, make=False).stage("adjust")
+    return load(record, pipeline["adjust"].module.Outputs).findings if read_record(record) else ()
 
 
 def _moved_m(adjusted: Any | None) -> np.ndarray:

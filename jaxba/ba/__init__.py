@@ -1,10 +1,8 @@
 """The solver: problem, residual groups, normal equations, Schur reduction, solve."""
 
-from jaxba.ba._check import Dropped, Prepared, prepare
 from jaxba.ba._check_gradients import GradientCheck, GradientRow, check_gradients
 from jaxba.ba._compiler import fast_jit
 from jaxba.ba._covariance import Covariance, covariance
-from jaxba.ba._gauge import free_gauge
 from jaxba.ba._plan import Plan, PlanShape, make_plan
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import project_in_cameras
@@ -16,6 +14,7 @@ from jaxba.ba._solve import solve
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt, residuals
 from jaxba.ba._tune import Tuned, tune
 from jaxba.ba._unknowns import Step, Unknowns
+from jaxba.ba.checks import Dropped, Prepared, free_gauge, prepare
 from jaxba.ba.groups import (
     PRIORS,
     AspectPrior,

@@ -25,8 +25,6 @@ from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._adjoint import Adjoint
-from jaxba.ba._check import prepare
-from jaxba.ba._gauge import require_gauge
 from jaxba.ba._linearise import linearise
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._problem import Problem
@@ -34,6 +32,7 @@ from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._system import initial_unknowns, make_system
 from jaxba.ba._traced import solve_to_the_last_digits
+from jaxba.ba.checks import prepare, require_gauge
 from jaxba.geometry import AbstractLoss, Linear, require_number
 
 _MOVES, _LARGEST_STEP = 0.05, 5e-3  # sigmas of all unknowns together; of the input's sigma

@@ -14,14 +14,13 @@ from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._check import Dropped, prepare
-from jaxba.ba._gauge import require_gauge
 from jaxba.ba._marginals import Marginals, marginals
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import rotation_matrices
 from jaxba.ba._system import System, initial_unknowns, make_system
 from jaxba.ba._unknowns import Unknowns
+from jaxba.ba.checks import Dropped, prepare, require_gauge
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
 MAX_UNKNOWNS = 6500  # 1000 images with one camera take 5 s and 0.8 GB beside what is loaded

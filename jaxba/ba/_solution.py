@@ -9,12 +9,10 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.ba._check import Dropped
-from jaxba.ba._gauge import free_gauge
-from jaxba.ba._plausible import implausible_cameras
 from jaxba.ba._problem import Problem
 from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
 from jaxba.ba._unknowns import Unknowns
+from jaxba.ba.checks import Dropped, free_gauge, implausible_cameras
 from jaxba.geometry import AbstractCamera, Pose
 
 RESULTS = {

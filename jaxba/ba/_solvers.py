@@ -10,7 +10,6 @@ point behind a camera or makes anything infinite has infinite cost, so it is ref
 """
 
 import abc
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,9 +22,17 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxba.ba._factor import solve_reduced
+from jaxba.ba._lengths import (
+    all_in_sigmas,
+    damping_scale,
+    length_in_sigmas,
+    norm_of,
+    scaled_norm_of,
+    slope_along,
+    sum_all,
+)
 from jaxba.ba._linearise import Linearisation, cost, curvature, linearise
 from jaxba.ba._refine import move_points, refine_points
-from jaxba.ba._rows import rows_of
 from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, reduce_vector, to_reduced
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
@@ -37,7 +44,6 @@ _MIN_RATIO = 1e-3
 # problems.
 _EXACT, _EXACT_SHRINK = 0.02, 0.03
 _BEND, _BEND_BELOW = 0.5, 0.1  # use half a robust loss's curvature once steps change the cost by less than a tenth
-_MIN_DIAGONAL = 1e-12  # of the largest entry of its kind
 _MAX_DAMPING = 1e16
 
 RUNNING, FTOL, XTOL, GTOL, STUCK, NOT_FINITE = range(6)
@@ -144,7 +150,7 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
         gradient_norm = _projected_gradient_norm(system, y, model.gradient)
         step, linear_iterations, shortened = self.propose(system, y, model, state.trust)
         step = _within_bounds(system, y, step)
-        promised = -_slope(model.gradient, step) - curvature(system, model, step) / 2
+        promised = -slope_along(model.gradient, step) - curvature(system, model, step) / 2
         moved = eqx.tree_at(lambda u: u.points, y.retract(step), move_points(system, y, step.points))
         trial, points_held = refine_points(system, moved, y, state.bend > 0)
         trial_cost = cost(system, trial)
@@ -153,12 +159,12 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
         ratio = jnp.where(finite & (promised > 0), change / promised, -1.0)
         at_optimum = gradient_norm <= self.atol
         accepted = (ratio > _MIN_RATIO) & ~at_optimum
-        trust, factor = self.adapt(state, ratio, _scaled_norm(step, model.diagonal))
+        trust, factor = self.adapt(state, ratio, scaled_norm_of(step, model.diagonal))
 
         # what little trust leaves of a step says nothing about the way to the optimum
         small = finite & (shortened * promised <= self.rtol * state.cost) & (jnp.abs(change) <= self.rtol * state.cost)
-        turn = shortened * _length(model, step)
-        short = finite & (turn <= self.xtol * (self.xtol + _length_of_all(system, y, model)))
+        turn = shortened * length_in_sigmas(model, step)
+        short = finite & (turn <= self.xtol * (self.xtol + all_in_sigmas(system, y, model)))
         status = jnp.where(self._exhausted(trust), STUCK, RUNNING)
         status = jnp.where(short, XTOL, status)
         status = jnp.where(small, FTOL, status)
@@ -171,7 +177,7 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
             cost=jnp.where(accepted, trial_cost, state.cost),
             change=jnp.where(accepted, change, 0.0),
             gradient_norm=gradient_norm,
-            step_norm=_norm(step),
+            step_norm=norm_of(step),
             linear_iterations=linear_iterations,
             points_held=points_held,
             accepted=accepted,
@@ -243,28 +249,28 @@ class SchurDogleg(AbstractSchurSolver):
 
     def propose(self, system: System, unknowns: Unknowns, model: Linearisation, trust: Float[Array, ""]) -> Proposal:
         newton, linear_iterations, _ = _damped_step(system, unknowns, model, jnp.asarray(1e-10, trust.dtype))
-        finite = jnp.isfinite(_norm(newton))
-        scale = _scale(model.diagonal)
+        finite = jnp.isfinite(norm_of(newton))
+        scale = damping_scale(model.diagonal)
         descent = jax.tree.map(lambda g, d, free: -free * g / d, model.gradient, scale, system.free)
         descent = _within_bounds(system, unknowns, descent)
         bent = curvature(system, model, descent)
-        length = jnp.where(bent > 0, -_slope(model.gradient, descent) / bent, 1.0)
+        length = jnp.where(bent > 0, -slope_along(model.gradient, descent) / bent, 1.0)
         cauchy = jax.tree.map(lambda d: length * d, descent)
-        cauchy_norm = _scaled_norm(cauchy, model.diagonal)
+        cauchy_norm = scaled_norm_of(cauchy, model.diagonal)
         cauchy = jax.tree.map(lambda c: c * jnp.minimum(1.0, trust / cauchy_norm), cauchy)
         newton = jax.tree.map(lambda n, c: jnp.where(finite, n, c), newton, cauchy)
         # the largest t in [0, 1] with |cauchy + t (newton - cauchy)| <= radius
         leg = jax.tree.map(jnp.subtract, newton, cauchy)
 
         def inner(a: Step, b: Step) -> Float[Array, ""]:
-            return _total(jax.tree.map(lambda x, y, d: jnp.sum(x * y * d), a, b, scale))
+            return sum_all(jax.tree.map(lambda x, y, d: jnp.sum(x * y * d), a, b, scale))
 
         a, b, c = inner(leg, leg), inner(cauchy, leg), inner(cauchy, cauchy) - trust**2
         root = jnp.sqrt(jnp.maximum(b**2 - a * c, 0.0))
         t = jnp.where(a > 0, -jnp.minimum(c, 0.0) / jnp.maximum(b + root, jnp.finfo(a.dtype).tiny), 1.0)
         t = jnp.clip(t, 0.0, 1.0)
         step = jax.tree.map(lambda c, d: c + t * d, cauchy, leg)
-        full, length = _scaled_norm(newton, model.diagonal), _scaled_norm(step, model.diagonal)
+        full, length = scaled_norm_of(newton, model.diagonal), scaled_norm_of(step, model.diagonal)
         return Proposal(step, linear_iterations, jnp.where(length > 0, jnp.maximum(full / length, 1.0), 1.0))
 
     def adapt(self, state: State, ratio: Float[Array, ""], scaled_norm: Float[Array, ""]) -> tuple[Array, Array]:
@@ -283,7 +289,7 @@ def _damped_step(system: System, unknowns: Unknowns, model: Linearisation, dampi
     D is the diagonal of J^T J for all but the points, and their own 3x3 blocks for these: axes of the world are not the
     ones in which a point is known, and along the ray of a far point the diagonal would outweigh what its images tell.
     """
-    scaled = jax.tree.map(lambda d: damping * d, _scale(model.diagonal))
+    scaled = jax.tree.map(lambda d: damping * d, damping_scale(model.diagonal))
     unseen = jnp.where(model.diagonal.points > 0, 0.0, 1.0)
     scaled = eqx.tree_at(lambda s: s.points, scaled, unseen)
     damped = eqx.tree_at(lambda m: m.point_products, model, (1 + damping) * model.point_products)
@@ -329,50 +335,3 @@ def _projected_gradient_norm(system: System, unknowns: Unknowns, gradient: Step)
         intrinsics = jnp.where((at_lower & (intrinsics > 0)) | (at_upper & (intrinsics < 0)), 0.0, intrinsics)
     projected = eqx.tree_at(lambda g: g.intrinsics, gradient, intrinsics)
     return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0.0) for leaf in jax.tree.leaves(projected)]))
-
-
-def _total(tree: PyTree) -> Float[Array, ""]:
-    """Sum scalars."""
-    return functools.reduce(jnp.add, jax.tree.leaves(tree))
-
-
-def _scale(diagonal: Step) -> Step:
-    """The diagonal of J^T J, kept away from zero relative to its kind."""
-
-    def scale(d: Array) -> Array:
-        largest = jnp.max(d, initial=0.0)
-        return jnp.maximum(d, jnp.where(largest > 0, _MIN_DIAGONAL * largest, 1.0))
-
-    return jax.tree.map(scale, diagonal)
-
-
-def _slope(gradient: Step, step: Step) -> Float[Array, ""]:
-    return _total(jax.tree.map(jnp.vdot, gradient, step))
-
-
-def _norm(step: Step) -> Float[Array, ""]:
-    return jnp.sqrt(_total(jax.tree.map(lambda s: jnp.sum(s**2), step)))
-
-
-def _scaled_norm(step: Step, diagonal: Step) -> Float[Array, ""]:
-    scale = _scale(diagonal)
-    return jnp.sqrt(_total(jax.tree.map(lambda s, d: jnp.sum(s**2 * d), step, scale)))
-
-
-def _length(model: Linearisation, step: Step) -> Float[Array, ""]:
-    """Length of a step in what its unknowns are known to, each by itself: in sigmas, if all others were fixed."""
-    blocks = (step.poses, model.diagonal.poses), (step.intrinsics, model.diagonal.intrinsics)
-    total = _total([jnp.sum(s**2 * d) for s, d in (*blocks, (step.lever_arm, model.diagonal.lever_arm))])
-    return jnp.sqrt(total + jnp.einsum("pi,pij,pj->", step.points, model.point_products, step.points))
-
-
-def _length_of_all(system: System, unknowns: Unknowns, model: Linearisation) -> Float[Array, ""]:
-    """The same of a step as long as the unknowns: a turn of one radian, the way from camera to point, all intrinsics.
-
-    `xtol` of it moves what the images see by about `xtol` radian. It depends neither on the origin of the world nor on
-    its unit, and a point at infinity adds to it what others do.
-    """
-    ray = unknowns.points - rows_of(unknowns.poses.center, system.point_image)
-    of_points = jnp.sum(ray**2, axis=1) * jnp.trace(model.point_products, axis1=1, axis2=2)
-    of_intrinsics = jnp.sum(unknowns.intrinsics**2 * model.diagonal.intrinsics)
-    return jnp.sqrt(jnp.sum(of_points) + of_intrinsics + jnp.sum(model.diagonal.poses[:, :3]))

@@ -17,10 +17,10 @@ from jax.core import Tracer
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba._check import Prepared, prepare
 from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, PlanShape, bucket, make_plan
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._unknowns import Step, Unknowns
+from jaxba.ba.checks import Prepared, prepare
 from jaxba.ba.groups import Reprojection
 from jaxba.geometry import AbstractLoss, Linear, Pose
 

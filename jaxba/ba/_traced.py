@@ -21,7 +21,6 @@ from threadpoolctl import threadpool_limits
 from jaxba._errors import JaxbaError
 from jaxba.ba._adjoint import Adjoint, Found, optimum, polish
 from jaxba.ba._descend import descend
-from jaxba.ba._gauge import require_gauge
 from jaxba.ba._linearise import costs
 from jaxba.ba._plan import LinearSolver, Plan, make_plan
 from jaxba.ba._problem import Problem
@@ -29,6 +28,7 @@ from jaxba.ba._solution import HistoryStep, Solution
 from jaxba.ba._solvers import AbstractSchurSolver, SchurLevenbergMarquardt, residuals
 from jaxba.ba._system import System, initial_unknowns, is_traced, make_system, restore, structured
 from jaxba.ba._unknowns import Unknowns
+from jaxba.ba.checks import require_gauge
 from jaxba.geometry import AbstractLoss
 
 _NOT_DOUBLE = (

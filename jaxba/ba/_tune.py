@@ -26,13 +26,12 @@ from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._adjoint import Adjoint
-from jaxba.ba._check import prepare
-from jaxba.ba._gauge import require_gauge
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._problem import AbstractPrior, Observations, Problem
 from jaxba.ba._selection import Selection, selected
 from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
+from jaxba.ba.checks import prepare, require_gauge
 from jaxba.geometry import AbstractLoss, Barron, Linear, check_loss, require_number
 
 _SHAPES = (-4.0, 2.0)  # of Barron's loss: the range that alpha is learned in

@@ -9,7 +9,7 @@ import pytest
 
 from jaxba._errors import JaxbaError
 from jaxba.ba import ControlPointPrior, Observations, PositionPrior, Problem
-from jaxba.ba._check import Reason, prepare
+from jaxba.ba.checks._check import Reason, prepare
 from jaxba.geometry import BAL, Pinhole, Pose
 from jaxba.simulation import uav_block
 

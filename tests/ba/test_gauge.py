@@ -11,7 +11,7 @@ from small_problems import RADIAL, small_problem
 
 from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem, free_gauge
-from jaxba.ba._gauge import require_gauge
+from jaxba.ba.checks._gauge import require_gauge
 from jaxba.ba.groups import AttitudePrior, ControlPointPrior, IntrinsicsPrior, LeverArmPrior, PositionPrior
 from jaxba.geometry import Pinhole, Pose
 from jaxba.simulation import uav_block

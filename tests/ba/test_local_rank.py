@@ -13,9 +13,9 @@ from small_problems import EVERY_CAMERA, small_problem
 import jaxba
 from jaxba._errors import JaxbaError
 from jaxba.ba import AttitudePrior, IntrinsicsPrior, PositionPrior, Problem, prepare
-from jaxba.ba._check import Reason
-from jaxba.ba._local_rank import pose_ranks, undetermined_intrinsics
 from jaxba.ba._projection import points_in_cam, project
+from jaxba.ba.checks._check import Reason
+from jaxba.ba.checks._local_rank import pose_ranks, undetermined_intrinsics
 from jaxba.geometry import AbstractCamera, OpenCV, Pinhole
 from jaxba.simulation import uav_block
 

@@ -12,7 +12,7 @@ from small_problems import EVERY_CAMERA, small_problem
 import jaxba
 from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem, prepare
-from jaxba.ba._plausible import implausible_cameras
+from jaxba.ba.checks._plausible import implausible_cameras
 from jaxba.geometry import BAL, AbstractCamera, OpenCV, OpenCVFisheye, Pose, Radial, SimplePinhole, SimpleRadial
 
 FOCAL = [(camera, name) for camera in EVERY_CAMERA for name in camera.parameter_names() if name.startswith("f")]

@@ -25,11 +25,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.ba._connected_parts import hat
-from jaxba.ba._gauge import prior_rows
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._unknowns import Unknowns
+from jaxba.ba.checks._connected_parts import hat
+from jaxba.ba.checks._gauge import prior_rows
 
 _NULL = 1e-12  # eigenvalue over the largest, as for the gauge
 _FEW_IMAGES, _FEW_ROWS = 8, 40  # of each camera that are looked at first: images, observations of each

@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._local_rank import pose_ranks, undetermined_intrinsics
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import points_in_cam, project
-from jaxba.ba._validate import validate
+from jaxba.ba.checks._local_rank import pose_ranks, undetermined_intrinsics
+from jaxba.ba.checks._validate import validate
 
 _GRAZING = 1e-6  # depth over distance: above it the formula of every model is finite, and need not be computed
 

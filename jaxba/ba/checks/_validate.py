@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._plausible import implausible_cameras
 from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba.checks._plausible import implausible_cameras
 from jaxba.geometry import check_loss
 
 _QUATERNION_NORM = 1e-3  # files round quaternions to a few digits; more than this is a mistake

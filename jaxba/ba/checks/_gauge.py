@@ -24,11 +24,11 @@ from scipy import sparse
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._compiler import fast_jit
-from jaxba.ba._connected_parts import Parts, hat, mean_by
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._rows import Rows
 from jaxba.ba._unknowns import Unknowns
-from jaxba.ba._validate import validate
+from jaxba.ba.checks._connected_parts import Parts, hat, mean_by
+from jaxba.ba.checks._validate import validate
 from jaxba.geometry import Pose
 
 _CHUNK = 256

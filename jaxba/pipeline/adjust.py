@@ -186,7 +186,13 @@ def run(inputs: Inputs, params: Params) -> Outputs:
 
 def lines(outputs: Outputs, told: Told) -> list[str]:
     """Return what was made, in words."""
-    return [f"median {outputs.median_px:.2f} px, {many(outputs.rounds, 'round')}", *grouped(told.left_out)]
+    made, factor = [f"median {outputs.median_px:.2f} px, {many(outputs.rounds, 'round')}"], outputs.variance_factor
+    if np.isfinite(factor):
+        made.append(
+            f"Variance factor {factor:.2f}: residuals scatter by {np.sqrt(factor):.2f} times the "
+            f"{outputs.std_px:.2f} px that weighed them; the sigmas of the results allow for it."
+        )
+    return [*made, *grouped(told.left_out)]
 
 
 def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
@@ -202,6 +208,8 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
         "observations": block.num_observations,
         "median_px": outputs.median_px,
         "inlier_rate": outputs.inlier_rate,
+        "variance_factor": outputs.variance_factor if np.isfinite(outputs.variance_factor) else None,
+        "std_px": outputs.std_px,
         "gnss_rms_m": None if outputs.gnss_rms_m is None else list(outputs.gnss_rms_m),
         "num_gnss": outputs.num_gnss,
         "camera_model": block.camera_model,

@@ -49,7 +49,7 @@ class Uncertainty:
     """Sigmas, NaN where they were not computed; `why_not` says why.
 
     - `position_std_m`, `point_std_m`: world. `intrinsics_std`: in the parameters' units, 0 for what is fixed.
-    - `variance_factor`: twice the cost over the redundancy, by the sigmas that weighed observations; NaN likewise.
+    - `variance_factor`: of the residuals, by the sigmas that weighed observations, tails aside; NaN likewise.
     """
 
     position_std_m: Float[np.ndarray, "images 3"]

@@ -1,6 +1,6 @@
 """The adjust stage: its outputs fit together, and its parameters reach the rounds."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from simulated import Simulated, simulate
 from jaxba import sfm
 from jaxba.pipeline import adjust
 from jaxba.pipeline.adjust import Inputs, Outputs, Params
+from jaxba.report import Told
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,21 @@ def test_outputs_are_of_one_block(outputs: Outputs, simulated: Simulated) -> Non
     assert outputs.inlier_rate == pytest.approx(block.num_observations / judged)
     assert judged <= simulated.tracks.num_observations
     assert outputs.rounds <= 3 and 0.5 < outputs.variance_factor < 1.5
+
+
+@pytest.mark.parametrize("factor", [0.25, 1.0, 4.0, float("nan")])
+def test_the_variance_factor_is_told(outputs: Outputs, simulated: Simulated, factor: float) -> None:
+    outputs = replace(outputs, variance_factor=factor, std_px=0.5)
+    told = Told(photos=tuple(photo.name for photo in simulated.photos))
+    line = [line for line in adjust.lines(outputs, told) if "ariance factor" in line]
+    found = adjust.facts(outputs, told)["adjust"]
+    assert found["std_px"] == 0.5
+    if np.isnan(factor):
+        assert line == [] and found["variance_factor"] is None
+    else:
+        times = {0.25: "0.50", 1.0: "1.00", 4.0: "2.00"}[factor]
+        assert f"factor {factor:.2f}: residuals scatter by {times} times the 0.50 px" in line[0]
+        assert found["variance_factor"] == factor
 
 
 def test_the_block_is_where_it_was_flown(outputs: Outputs, simulated: Simulated) -> None:

@@ -62,8 +62,9 @@ def solve(
     - `loss`: robust loss of the reprojections, in units of their sigma; least squares if None. Priors carry their own.
     - `method`: `lm`, Levenberg-Marquardt, or `dogleg`.
     - `linear_solver`: how the reduced system is solved; `auto` chooses from its size and bandwidth.
-    - `max_nfev`: the most steps tried. `ftol`, `xtol`, `gtol`: stop when the cost, the unknowns or the gradient no
-      longer change, as in scipy.
+    - `max_nfev`: the most steps tried. `ftol`: stop when the cost changes by less than this share. `xtol`: when all
+      unknowns together move what the images see by less than so many radians. `gtol`: when no entry of the gradient is
+      larger, as in scipy.
     - `plan`: the problem's structure, made by `make_plan`; needed where the problem's indices are traced. Where
       something is left out of the problem, a new plan of the same sizes takes its place.
     - `adjoint`: how derivatives are taken. `implicit`: of the optimum, exact. `gauss_newton`: the same with J^T J in

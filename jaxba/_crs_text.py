@@ -60,7 +60,7 @@ def authority_code(crs: CRS) -> str | None:
     return next((code for code in _likely(crs) if CRS(code).equals(crs, ignore_axis_order=True)), None)
 
 
-def shown(text: str, longest: int = 200) -> str:
+def shown(text: str, longest: int = 120) -> str:
     """Return a text of a length that a message can repeat, in characters."""
     return text if len(text) <= longest else text[: longest - 3] + "..."
 

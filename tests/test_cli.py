@@ -7,6 +7,7 @@ import sys
 import typing
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxba
-from jaxba.cli import _progress, _solve, main
+from jaxba.cli import _gradcheck, _progress, _solve, main
 from jaxba.cli._info import components
 from jaxba.cli._options import LossName, SolveOptions
 from jaxba.cli._text import to_json
@@ -363,7 +364,15 @@ def test_compilation_cache_is_in_the_users_folder_if_that_can_be(tmp_path: Path,
     assert before == ("None" if case != "jax's own variable" else expected)  # imports alone set nothing
 
 
-def test_gradcheck_prints_a_table_and_exits_by_its_tolerance(cli: Cli, tmp_path: Path):
+def test_gradcheck_prints_a_table_and_exits_by_its_tolerance(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    checked: list[jaxba.GradientCheck] = []
+
+    def once(*given: Any, tolerance: float, **options: Any) -> jaxba.GradientCheck:
+        if not checked:
+            checked.append(jaxba.check_gradients(*given, tolerance=tolerance, **options))
+        return dataclasses.replace(checked[0], tolerance=tolerance)  # another tolerance is not another computation
+
+    monkeypatch.setattr(_gradcheck, "check_gradients", once)
     path = tmp_path / "tile.npz"
     jaxba.write_tile(path, small_survey().problem)
     code, out, _ = cli("gradcheck", path, "--fix", "intrinsics", "--loss", "cauchy", "--f-scale", 2)

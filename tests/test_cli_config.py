@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from jaxba.cli import main
 from jaxba.engine import explained, from_toml
@@ -90,15 +91,17 @@ def test_the_file_of_the_working_folder_counts_and_is_said(cli, tmp_path: Path):
         code, _, err = cli(*command)
         assert code == 2 and message in err
     (tmp_path / "jaxba.toml").write_text("[match]\nratio = 0.7\n")
-    code, _, err = cli("run", "photos")
-    assert err.startswith(f"settings are those of {tmp_path / 'jaxba.toml'}\n") and "there is no photo" in err
+    Image.new("L", (640, 480), 90).save(tmp_path / "photos" / "a.jpg")
+    code, _, err = cli("run", "photos", "--stage", "metadata")
+    assert code == 0 and err.startswith(f"settings are those of {tmp_path / 'jaxba.toml'}\n")
     assert from_toml(tmp_path / "project" / "jaxba.toml", PIPELINE.settings)["match"].ratio == 0.7  # pyright: ignore
 
 
 def test_set_wins_over_the_file_and_the_file_over_the_default(cli, tmp_path: Path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "my.toml").write_text("[match]\nratio = 0.7\nmin_good = 40\n[crs]\nstd_h = 2\n")
-    cli("run", "photos", "--config", "my.toml", "--set", "match.ratio=0.65")
+    Image.new("L", (640, 480), 90).save(tmp_path / "photos" / "a.jpg")
+    cli("run", "photos", "--stage", "metadata", "--config", "my.toml", "--set", "match.ratio=0.65")
     settings = from_toml(tmp_path / "project" / "jaxba.toml", PIPELINE.settings)
     assert (settings["match"].ratio, settings["match"].min_good) == (0.65, 40)  # pyright: ignore
     assert settings["crs"].std_h == 2.0 and settings["crs"].std_v == 5.0  # pyright: ignore

@@ -37,7 +37,8 @@ from jaxba.geometry import AbstractLoss, Linear, require_number
 
 _MOVES, _LARGEST_STEP = 0.05, 5e-3  # sigmas of all unknowns together; of the input's sigma
 _SHARES = (1.0, 1 / 4, 1 / 16)  # of that step
-_TIGHT: dict[str, Any] = {"ftol": 0.0, "xtol": 1e-13, "gtol": 0.0, "max_nfev": 100}
+# near enough for the Newton steps of `solve_to_the_last_digits`, which double the digits; nearer takes twice the steps
+_TIGHT: dict[str, Any] = {"ftol": 0.0, "xtol": 1e-10, "gtol": 0.0, "max_nfev": 100}
 _TINY = float(np.finfo(float).tiny)
 _SIZE_M, _SIZE_PX, _SIZE_RAD, _SIZE_SHAPE = 0.01, 1.0, 1e-3, 1e-3  # of a direction, for what has no sigma of its own
 

@@ -85,7 +85,8 @@ def test_a_nan_in_colmap(export: Path):
     row = next(k for k, line in enumerate(lines) if line.startswith("5 "))
     lines[row] = " ".join(["5", "inf", *lines[row].split()[2:]])
     path.write_text("\n".join(lines))
-    assert "X of POINT3D_ID 5 is inf" in failures(export)["numbers colmap/text/points3D.txt"]
+    found = failures(export)
+    assert f"points3D.txt, line {row + 1}: damaged (inf is not a finite number)" in found["schema colmap/text"]
 
 
 def lose_las(export: Path) -> None:

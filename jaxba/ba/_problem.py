@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._rows import Rows
-from jaxba.ba._selection import Selection, selected, selected_names
+from jaxba.ba._selection import Selection, holds_tracer, selected, selected_names
 from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractCamera, AbstractLoss, Pose
 
@@ -184,12 +184,12 @@ class Problem(eqx.Module):
         model, names = type(self.cameras).__name__, type(self.cameras).parameter_names()
         fixed_poses = selected("fix: poses", poses, self.num_images, "images")
         fixed_points = selected("fix: points", points, self.num_points, "points")
-        if np.ndim(intrinsics) == 2 and np.shape(intrinsics) == self.free.intrinsics.shape:
-            of_cameras = np.ravel(np.asarray(intrinsics))
-            fixed = selected("fix: intrinsics", of_cameras, of_cameras.size, "intrinsics of cameras")
+        of_cameras = np.zeros(0) if holds_tracer(intrinsics) else np.asarray(intrinsics, object)
+        if of_cameras.shape == self.free.intrinsics.shape:
+            fixed = selected("fix: intrinsics", of_cameras.reshape(-1), of_cameras.size, "intrinsics of all cameras")
             fixed_intrinsics = fixed.reshape(self.free.intrinsics.shape)
         else:
-            fixed_intrinsics = selected_names("fix: intrinsics", intrinsics, names, f"intrinsics of a {model} camera:")
+            fixed_intrinsics = selected_names("fix: intrinsics", intrinsics, names, f"intrinsics of a {model} camera")
         free = Free(
             np.asarray(self.free.poses) & ~fixed_poses,
             np.asarray(self.free.points) & ~fixed_points,

@@ -38,9 +38,10 @@ def selected(label: str, value: Selection, count: int, kind: str) -> Bool[np.nda
     if isinstance(value, slice):
         mask[value] = True
         return mask
-    if isinstance(value, Tracer):
+    value = _plain(value)
+    if holds_tracer(value):
         raise JaxbaError(f"{label}: the {kind} are traced, as arguments of jit are; choose them outside of it.")
-    array = _array(_plain(value))
+    array = _array(value)
     if array.dtype == bool:
         if array.shape not in ((), (count,)):
             raise JaxbaError(
@@ -67,18 +68,25 @@ def selected(label: str, value: Selection, count: int, kind: str) -> Bool[np.nda
 def selected_names(label: str, value: Selection, names: Sequence[str], kind: str) -> Bool[np.ndarray, " names"]:
     """Return True for each name that is meant: a name, names, or what `selected` takes."""
     value = [value] if isinstance(value, str) else _plain(value)
-    array = None if isinstance(value, slice | Tracer) else _array(value)
+    array = None if isinstance(value, slice) or holds_tracer(value) else _array(value)
     if array is None or array.dtype.kind != "U":
         return selected(label, value, len(names), kind)
     for name in array.reshape(-1).tolist():
         if name not in names:
-            raise JaxbaError(f"{label}: {name!r} is none of the {kind} {', '.join(names)}; choose from these.")
+            raise JaxbaError(f"{label}: {name!r} is none of the {kind}: {', '.join(names)}; choose from these.")
     return np.isin(names, array)
 
 
+def holds_tracer(value: Any) -> bool:
+    """Whether a choice, or an entry of it, is a tracer of jax's."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
+
+
 def _plain(value: Any) -> Any:
-    """Return sets, ranges and generators as lists, and all else as it is."""
-    is_array = isinstance(value, np.ndarray | np.generic | jax.Array | str)
+    """Return sets, ranges, generators and arrays of objects (as pandas keeps names) as lists, all else as it is."""
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return value.tolist()
+    is_array = isinstance(value, np.ndarray | np.generic | jax.Array | str | bytes)
     return list(value) if isinstance(value, Iterable) and not is_array else value
 
 

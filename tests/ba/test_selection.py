@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ FIRST_AND_LAST = {
     "unsigned": np.array([0, 7], np.uint8),
     "jax": jnp.array([0, 7]),
     "list of numpy": [np.int64(0), np.array(7)],
+    "objects": np.array([0, 7], object),
     "mask": np.isin(np.arange(8), [0, 7]),
     "list of bools": [i in (0, 7) for i in range(8)],
     "list of numpy bools": [np.bool_(i in (0, 7)) for i in range(8)],
@@ -107,7 +109,12 @@ def test_what_is_no_choice_is_named(block: Problem, case: str):
 
 
 @pytest.mark.parametrize(
-    "names", ["k1", ["k1"], ("k1", "k1"), np.array(["k1"]), np.str_("k1"), 4, np.isin(NAMES, "k1"), {"k1"}], ids=str
+    "names",
+    [
+        *("k1", ["k1"], ("k1", "k1"), np.array(["k1"]), np.str_("k1"), 4, np.isin(NAMES, "k1"), {"k1"}),
+        *(np.array(["k1"], object), np.array([4], object), np.isin(NAMES, "k1").astype(object)),
+    ],
+    ids=repr,
 )
 def test_intrinsics_are_held_by_name_place_or_mask(block: Problem, names: Any):
     assert fixed(block.fix(intrinsics=names).free.intrinsics[0]) == [4, 8]
@@ -128,7 +135,11 @@ def test_intrinsics_are_held_camera_by_camera():
         ("f", "'f' is none of"),
         (9, "index 9, but there are 9"),
         (np.ones((3, 9), bool), r"a mask of shape \(3, 9\)"),
+        (9, "but there are 9 intrinsics of a OpenCV camera, counted from 0"),
         (["k1", 2], "of type object"),
+        ([["k1"], ["k1", "k2"]], "of type object"),
+        (b"k1", "of type .S2"),
+        (np.array(["k1", 2], object), "of type object"),
     ],
 )
 def test_an_unknown_intrinsic_is_named(block: Problem, value: Any, message: str):
@@ -157,3 +168,30 @@ def test_bounds_are_numbers_or_one_for_each_camera():
 def test_bounds_that_are_none_are_named(block: Problem, pair: Any, message: str):
     with pytest.raises(JaxbaError, match=message):
         block.bound(k1=pair)
+
+
+@pytest.mark.parametrize("of", ["index", "entry", "mask"])
+def test_a_traced_choice_is_named(block: Problem, of: str):
+    def hold(traced: jax.Array) -> jax.Array:
+        given: dict[str, Any] = {"index": {"poses": traced}, "entry": {"points": [traced]}}
+        return jnp.asarray(block.fix(**given.get(of, {"intrinsics": jnp.ones((1, 9)) == traced})).free.poses)
+
+    with pytest.raises(JaxbaError, match="are traced, as arguments of jit are; choose them outside"):
+        jax.jit(hold)(0)
+
+
+@pytest.mark.parametrize("kind", [list, np.array, lambda mask: np.array(mask, object)])
+def test_a_list_of_lists_masks_the_intrinsics_of_each_camera(kind: Any):
+    problem = uav_block(8, num_cameras=2).problem
+    mask = [[name == "k1" for name in NAMES], [name == "p2" for name in NAMES]]
+    free = problem.fix(intrinsics=kind(mask)).free.intrinsics
+    assert (free == (problem.free.intrinsics & ~np.array(mask))).all()
+
+
+def test_names_as_a_table_keeps_them_are_names():
+    problem = uav_block(8).problem.fix(intrinsics=np.array(["k1", "p2"], object))
+    assert [name for name, free in zip(NAMES, problem.free.intrinsics[0], strict=True) if not free] == [
+        "k1",
+        "p2",
+        "k3",
+    ]

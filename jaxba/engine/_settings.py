@@ -52,7 +52,9 @@ def from_toml(path: Path, settings: Settings) -> dict[str, Parameters]:
     except (OSError, UnicodeDecodeError) as error:
         raise JaxbaError(f"{path}: cannot be read as text ({error}).") from error
     except tomllib.TOMLDecodeError as error:
-        raise JaxbaError(f"{path}: is no TOML ({error}); write tables such as [match] and lines ratio = 0.7.") from None
+        raise JaxbaError(
+            f"{path}: is not valid TOML ({error}); write tables such as [match] and lines ratio = 0.7."
+        ) from None
     result = dict(settings)
     try:
         for section, table in tables.items():

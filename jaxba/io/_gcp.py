@@ -142,10 +142,10 @@ def _read_list(content: list[Line], name: str, is_photo: Callable[[str], bool]) 
         where = f"{name} line {line}"
         cells = _cells(words)
         if len(cells) < 6:
-            commas = " Separate columns by blanks, or name them in a header line." if words.count(",") >= 5 else ""
-            raise JaxbaError(
-                f"{where}: '{words}' has {len(cells)} columns; give x y z px py image, then a name.{commas}"
-            )
+            is_csv = max(map(words.count, ",;")) >= 5
+            cure = " Separate columns by blanks, or name them in a header line." if is_csv else ""
+            count = "1 column" if len(cells) == 1 else f"{len(cells)} columns"
+            raise JaxbaError(f"{where}: '{words}' has {count}; give x y z px py image, then a name.{cure}")
         x, y, px, py = (read_number(cells[k], where, label) for k, label in ((0, "x"), (1, "y"), (3, "px"), (4, "py")))
         image, rest = split_image(cells[5], is_photo)
         is_cell = rest.lstrip(" ").startswith("\t")  # else a blank ends the point's name

@@ -132,10 +132,10 @@ def _read_geo(content: list[Line], name: str, is_photo: Callable[[str], bool]) -
         where = f"{name} line {line}"
         count = 1 + len(cells)
         if count < 3:
-            commas = " Separate columns by blanks, or name them in a header line." if words.count(",") >= 2 else ""
-            raise JaxbaError(
-                f"{where}: '{words}' has {count} columns; give image x y, then z and more if known.{commas}"
-            )
+            is_csv = max(map(words.count, ",;")) >= 2
+            cure = " Separate columns by blanks, or name them in a header line." if is_csv else ""
+            found = "1 column" if count == 1 else f"{count} columns"
+            raise JaxbaError(f"{where}: '{words}' has {found}; give image x y, then z and more if known.{cure}")
         x, y = (read_number(cell, where, label) for cell, label in zip(cells, "xy", strict=False))
         # what follows a full set of columns is a label; a set that is not full must not be taken for one
         if count not in _WIDTHS and count < _WIDTHS[-1]:

@@ -23,6 +23,7 @@ _FAR, _NEAR, _SPREADS = 10.0, 1.0, 3.0
 _LARGEST = 1e12
 
 _IMAGE = re.compile(r"\.(jpe?g|jpe|jp2|tiff?|png|bmp|webp|dng|heic|heif|arw|cr2|cr3|nef|raf|rw2|orf)$", re.IGNORECASE)
+_ANGLE = re.compile(r"\d\s*[°º'\"\u2032\u2033\u2019\u201dNSEW]", re.IGNORECASE)
 _QUOTED = re.compile(r"""(["'])(.+?)\1(?=\s|$)""")
 
 
@@ -47,9 +48,10 @@ def read_height(text: str, where: str) -> float | None:
 def _finite(text: str, where: str, label: str) -> float:
     value = number_or_nan(text)
     if not math.isfinite(value):
-        raise JaxbaError(
-            f"{where}: {label} '{text}' is no number; write it with a point, without unit or thousands marks."
-        )
+        form = "with a point, without unit or thousands marks"
+        if label in ("x", "y", "longitude", "latitude") and _ANGLE.search(text):
+            form = "in degrees with decimals, south and west negative"
+        raise JaxbaError(f"{where}: {label} '{text}' is no number; write it {form}.")
     return value
 
 

@@ -172,4 +172,5 @@ def refuse_degrees_out_of_range(crs: str, x: float, y: float, where: str) -> Non
         return
     for label, value, limit in (("longitude", x, 180), ("latitude", y, 90)):
         if abs(value) > limit:
-            raise JaxbaError(f"{where}: {label} {value:g} is out of range; x is the longitude, y the latitude.")
+            metres = " It looks like metres: write the projected CRS that it is in." if abs(value) > 20_000 else ""
+            raise JaxbaError(f"{where}: {label} {value:g} is out of range; x is the longitude, y the latitude.{metres}")

@@ -3,13 +3,16 @@
 | file | photo | who writes it so |
 | --- | --- | --- |
 | `IMG_1_mask.png`, of any image suffix | `IMG_1.JPG` in the same folder | OpenDroneMap |
+| `IMG_1.mask.png`, `IMG_1.JPG.mask.png` | `IMG_1.JPG` in the same folder | OpenMVS, RealityCapture |
 | `masks/IMG_1.JPG.png` | `IMG_1.JPG` | COLMAP, OpenSfM |
 | `masks/IMG_1.png`, `masks/IMG_1_mask.png` | `IMG_1.JPG` | Metashape, and by hand |
+| `IMG_1-mask.png`, `mask_IMG_1.png` | `IMG_1.JPG` in the same folder | by hand |
 
-A `masks` folder may stand anywhere below the photos, and mirrors the folders of the photos beside it. Names are
-compared without regard to case. Where a mask is black (0), no features are taken.
+A folder `masks` (or `mask`, `_masks`, `flight1_masks`) may stand anywhere below the photos, and mirrors the folders of
+the photos beside it. Names are compared without regard to case. Where a mask is black (0), no features are taken.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import PurePosixPath
@@ -19,8 +22,8 @@ from jaxba.engine._words import some
 from jaxba.scene import Photo, PhotoFile
 from jaxba.vision import image_size
 
-_FOLDERS = ("masks", "mask")
-_ENDING = "_mask"
+_FOLDER = re.compile(r"(.*[_\-. ])?masks?")
+_WORD = re.compile(r"[_\-. ]masks?$|^masks?[_\-.]|^masks?$")
 _SAME_FORMAT = 0.01  # width over height, of a mask that was drawn in photos of another scale
 
 
@@ -31,7 +34,7 @@ def is_mask(name: str) -> bool:
     (True, True, False)
     """
     path = PurePosixPath(name.lower())
-    return path.stem.endswith(_ENDING) or any(part in _FOLDERS for part in path.parts[:-1])
+    return _WORD.search(path.stem) is not None or any(_FOLDER.fullmatch(part) for part in path.parts[:-1])
 
 
 def with_masks(photos: Sequence[Photo], masks: Sequence[PhotoFile]) -> tuple[list[Photo], list[str]]:
@@ -63,8 +66,9 @@ def with_masks(photos: Sequence[Photo], masks: Sequence[PhotoFile]) -> tuple[lis
     notes = []
     if found:
         first, mask = next(iter(found.items()))
+        has, more = ("has", "") if len(found) == 1 else ("have", ", ...")
         notes.append(
-            f"{len(found)} of {len(photos)} photos have a mask ({first}: {mask.name}, ...): no features are taken "
+            f"{len(found)} of {len(photos)} photos {has} a mask ({first}: {mask.name}{more}): no features are taken "
             "where it is black."
         )
     if strangers:
@@ -75,8 +79,8 @@ def with_masks(photos: Sequence[Photo], masks: Sequence[PhotoFile]) -> tuple[lis
 def _owner(name: str, keys: dict[str, list[str]]) -> str | None:
     """Return the photo whose mask a file is; None for no photo, or one of several."""
     path = PurePosixPath(name.lower())
-    stem = path.stem.removesuffix(_ENDING)
-    folder = PurePosixPath(*(part for part in path.parts[:-1] if part not in _FOLDERS))
+    stem = _WORD.sub("", path.stem)
+    folder = PurePosixPath(*(part for part in path.parts[:-1] if not _FOLDER.fullmatch(part)))
     for key in ((folder / stem).as_posix(), stem):
         if len(keys.get(key, ())) == 1:
             return keys[key][0]

@@ -19,7 +19,7 @@ from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._project import FOUND_LISTS
 from jaxba.engine._words import many, some_photos
-from jaxba.io import Geotag, match_geotags, parse_geotags, photo_names
+from jaxba.io import Geotag, match_geotags, parse_geotags, photo_names, without_fillers
 from jaxba.pipeline._masks import is_mask, with_masks
 from jaxba.report import Told, grouped, with_ranges
 from jaxba.scene import Attitude, LeftOut, Photo, PhotoFile
@@ -99,6 +99,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     photos, spellings = shared_cameras(photos)
     photos, masked = with_masks(photos, masks)
     notes = [*_file_notes(inputs), *masked, *spellings, *_camera_notes(photos, params.focal), *_photo_notes(photos)]
+    photos, heightless = _without_false_heights(photos)
+    notes += heightless
     if geotags is not None:
         entries, found = match_geotags(geotags, [photo.name for photo in photos], inputs.geotags_name)
         entries, told = _with_heights_in_metres(entries, inputs.geotags_name)
@@ -177,6 +179,22 @@ def _photo_notes(photos: list[Photo]) -> list[str]:
             f"{more} more findings, each of as many photos or fewer, stand in the photos' notes.",
         ]
     return notes
+
+
+def _without_false_heights(photos: list[Photo]) -> tuple[list[Photo], list[str]]:
+    """Return photos without the heights in their tags that are none, such as -9999, or 0 among others; and notes."""
+    rows = [k for k, photo in enumerate(photos) if photo.position is not None and photo.position.z_m is not None]
+    positions = [position for photo in photos if (position := photo.position) is not None and position.z_m is not None]
+    z, notes = without_fillers(
+        [position.z_m for position in positions], [photos[k].name for k in rows], "Tags", kind="photo",
+        so="; only their horizontal position is used", cure=" If 0 was measured, give the heights in a geo.txt.",
+    )  # fmt: skip
+    changed = list(photos)
+    for k, position, z_m in zip(rows, positions, z, strict=True):
+        if z_m is None:
+            flat = dataclasses.replace(position, z_m=None, height_kind="unknown")
+            changed[k] = dataclasses.replace(photos[k], position=flat)
+    return changed, notes
 
 
 def _with_heights_in_metres(entries: dict[str, Geotag], name: str) -> tuple[dict[str, Geotag], list[str]]:

@@ -21,6 +21,7 @@ from jaxba.scene import Lens, Photo
 from jaxba.vision._exif import BASE, Tags, text
 
 _LENS_SERIAL = 0xA435
+_DRONE_SERIALS = ("drone-dji:DroneSerialNumber", "drone-parrot:SerialNumber", "drone:DroneSerialNumber")
 _DASHES = re.compile("[\u2010-\u2015\u2212]")
 _ZEROS = re.compile(r"(\d\.\d*?)0+(?!\d)")
 _NUMBERS: tuple[tuple[Callable[[Photo], float | None], float, str, bool], ...] = (
@@ -37,11 +38,14 @@ def find_lens(tags: Tags, make: str, model: str, focal_mm: float | None) -> Lens
     name = model if model.lower().startswith(make.lower()) else f"{make} {model}"
     serial = tags.text(BASE.BodySerialNumber) or text(tags.xmp.get("drone-dji:CameraSerialNumber"))
     serial = serial or text(tags.xmp.get("aux:SerialNumber"))
+    drone = "" if serial.strip("0") else text(next(filter(None, map(tags.xmp.get, _DRONE_SERIALS)), ""))
     lens = tags.text(BASE.LensModel) or text(tags.xmp.get("aux:Lens"))
     lens_serial = tags.text(_LENS_SERIAL)
     parts = [name.strip() or "unknown camera"]
     if serial.strip("0"):
         parts.append(f"serial {serial}")
+    if drone.strip("0"):
+        parts.append(f"drone {drone}")
     if lens and _spelled(lens) != _spelled(model):
         parts.append(lens)
     if lens_serial.strip("0"):

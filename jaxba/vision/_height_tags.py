@@ -36,6 +36,11 @@ def find_height(tags: Tags, rtk_flag: float | None, notes: list[str]) -> tuple[f
     if absolute_m is None:
         return z_m, kind
     is_rtk = tags.xmp.get("drone-dji:AltitudeType") == "RtkAlt" if rtk_flag is None else rtk_flag >= 16
+    if z_m == 0 and abs(absolute_m) > _MOST_GEOID_M:
+        notes.append(
+            f"the height of {source} is 0, that of XMP's AbsoluteAltitude {absolute_m:g} m; the latter is taken."
+        )
+        z_m = None
     if z_m is None:
         z_m = absolute_m
     else:
@@ -83,9 +88,10 @@ def _compared(
             )
         z_m = math.copysign(z_m, other_m)
     if abs(z_m - other_m) >= _rounding_m(z_m):
+        cause = "they are above two surfaces, or one is wrong" if abs(z_m - other_m) < _MOST_GEOID_M else "one is wrong"
         notes.append(
             f"the height of {source} lies {abs(z_m - other_m):.2f} m {'above' if z_m > other_m else 'below'} that of "
-            f"{other}: they are above two surfaces, or one is wrong; that of {source} is used."
+            f"{other}: {cause}; that of {source} is used."
         )
     return z_m
 

@@ -1,7 +1,8 @@
 """The position that a photo's tags state, with its accuracy, and what its height is above.
 
 Latitude and longitude come from EXIF; DJI and Autel write them once more in XMP, with more digits, which are taken
-where both agree to within EXIF's own rounding (5e-7 degrees, 5 cm): after post-processing EXIF is the newer one. Some
+where both agree to within EXIF's own rounding (5e-7 degrees, 5 cm; more where its seconds have few decimals, such as
+15 m of whole seconds): after post-processing EXIF is the newer one. Some
 editors leave nothing but XMP's own copy of the EXIF tags (`exif:GPSLatitude`), which is read last.
 
 In EXIF the hemisphere is a tag of its own, which gets lost; in XMP it is part of the number. So a hemisphere that EXIF
@@ -34,10 +35,14 @@ _UNITS = re.compile(r"\s*(?:DEG(?:REES?)?|MIN(?:UTES?)?|SEC(?:ONDS?)?|[°º˚'\"
 
 @dataclass(frozen=True)
 class _Angle:
-    """Degrees, south and west negative. `is_signed`: the source states the hemisphere."""
+    """Degrees, south and west negative.
+
+    - `is_signed`: the source states the hemisphere. `rounding_deg`: half its last digit.
+    """
 
     deg: float
     is_signed: bool
+    rounding_deg: float = _DISAGREEMENT_DEG
 
 
 _Place = tuple[_Angle, _Angle]  # latitude, longitude
@@ -97,12 +102,14 @@ def _latitude_longitude(tags: Tags, notes: list[str]) -> tuple[float, float, str
     for source in list(found)[1:]:
         other = found[source]
         apart = max(_apart(latitude, other[0]), _apart(longitude, other[1]))
-        if (first, source) == (_EXIF, _DRONE) and apart <= _EXIF_ROUNDING_DEG:
+        digits_deg = min(angle.rounding_deg for angle in found[first])
+        rounding_deg = max(_EXIF_ROUNDING_DEG, digits_deg) if first == _EXIF else _DISAGREEMENT_DEG
+        if (first, source) == (_EXIF, _DRONE) and apart <= rounding_deg:
             latitude, longitude = (
                 math.copysign(angle.deg, ours) for angle, ours in zip(other, (latitude, longitude), strict=True)
             )
             first = _DRONE
-        elif apart > _DISAGREEMENT_DEG:
+        elif apart > max(rounding_deg, min(angle.rounding_deg for angle in other)):
             notes.append(
                 f"{first} says {latitude:.7f}, {longitude:.7f} and {source} {other[0].deg:.7f}, {other[1].deg:.7f}; "
                 f"{first} is used."
@@ -158,7 +165,8 @@ def _angle(gps: Any, tag: ExifTags.GPS, ref_tag: ExifTags.GPS, notes: list[str])
     raw = gps.get(tag)
     if raw is None:
         return None
-    deg = _degrees([number(part) for part in (raw if isinstance(raw, tuple | list) else (raw,))])
+    parts = [number(part) for part in (raw if isinstance(raw, tuple | list) else (raw,))]
+    deg = _degrees(parts)
     if deg is None:
         notes.append(f"{tag.name} {raw} is no angle and counts as absent.")
         return None
@@ -167,7 +175,8 @@ def _angle(gps: Any, tag: ExifTags.GPS, ref_tag: ExifTags.GPS, notes: list[str])
     if letter and letter not in letters:
         notes.append(f"{ref_tag.name} {gps.get(ref_tag)!r} is neither {letters[0]} nor {letters[1]}.")
     is_signed = bool(letter) and letter in letters
-    return _Angle(-deg if is_signed and letter == letters[1] else deg, is_signed or deg < 0)
+    is_south_or_west = is_signed and letter == letters[1]
+    return _Angle(-deg if is_south_or_west else deg, is_signed or deg < 0, _rounding_deg(parts))
 
 
 def _degrees(parts: list[float | None]) -> float | None:
@@ -178,12 +187,26 @@ def _degrees(parts: list[float | None]) -> float | None:
     return sum(part / 60**power for power, part in enumerate(known))
 
 
+def _rounding_deg(parts: list[float | None]) -> float:
+    """Return half the last digit of degrees, minutes, seconds, in degrees; zeros behind a fraction are no digits.
+
+    >>> [round(3600 * _rounding_deg([47.0, *rest]), 6) for rest in ((30.0, 36.0), (30.0, 36.25), (30.5, 0.0))]
+    [0.5, 0.005, 3.0]
+    """
+    known = [part for part in parts if part is not None]
+    while len(known) > 1 and known[-1] == 0 and known[-2] % 1:
+        known.pop()
+    places = next((places for places in range(9) if abs(known[-1] - round(known[-1], places)) < 1e-9), 9)
+    return 0.5 * 10.0**-places / 60 ** (len(known) - 1)
+
+
 def _drone_angle(tags: Tags, *names: str) -> _Angle | None:
     """Return a drone's decimal degrees; the sign of a number without one is not stated."""
     for name in drone_names(*names):
         deg = number(tags.xmp.get(name))
         if deg is not None:
-            return _Angle(deg, tags.xmp[name].strip()[:1] in "+-")
+            words = tags.xmp[name].strip()
+            return _Angle(deg, words[:1] in "+-", 0.5 * 10.0 ** -len(words.partition(".")[2]))
     return None
 
 

@@ -76,6 +76,16 @@ def test_csv_of_longitude_and_latitude_is_wgs_84():
         ("EPSG:99999\n1 2 3 4 5 a.jpg", "line 1: 'EPSG:99999' is no CRS; give EPSG:4326"),
         ("WGS84 UTM 61N\n1 2 3 4 5 a.jpg", "line 1: 'WGS84 UTM 61N': UTM zone 61 does not exist"),
         ("1 2 3 4 5 a.jpg", "line 1: '1 2 3 4 5 a.jpg' is no CRS"),
+        ("EPSG:32615\n1;2;3;4;5;a.jpg", r"has 1 column; .*Separate columns by blanks, or name"),
+        (
+            "EPSG:4326\n93\u00b012.02'W 44 3 4 5 a.jpg",
+            "line 2: x '93.*' is no number; write it in degrees with decimals",
+        ),
+        ("EPSG:4326\n93.2W 44 3 4 5 a.jpg", "line 2: x '93.2W' is no number; write it in degrees with decimals, south"),
+        (
+            "EPSG:4326\n484201.5 4971853 3 4 5 a.jpg",
+            "longitude 484202 is out of range; .*It looks like metres: write the",
+        ),
         ("EPSG:32615\n1 2 3 4 a.jpg", r"line 2: '1 2 3 4 a.jpg' has 5 columns; give x y z px py image"),
         ("EPSG:32615\n1 2 3,5 4 5 a.jpg", "line 2: z '3,5' is no number; write it with a point"),
         ("EPSG:32615\n1 nan 3 4 5 a.jpg", "line 2: y 'nan' is no number"),
@@ -92,7 +102,7 @@ def test_csv_of_longitude_and_latitude_is_wgs_84():
         ),
         (
             "EPSG:32615\n1,2,3,4,5,a.jpg",
-            "line 2: '1,2,3,4,5,a.jpg' has 1 columns; .*Separate columns by blanks, or name",
+            "line 2: '1,2,3,4,5,a.jpg' has 1 column; .*Separate columns by blanks, or name",
         ),
         (
             "# CoordinateSystem: EPSG:32615\n#Label,X/Easting,Y/Northing,Z/Altitude\np,1,2,3\n",

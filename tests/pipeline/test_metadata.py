@@ -250,6 +250,43 @@ def test_one_finding_that_differs_in_its_figures_alone_is_one_line(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
+    ("heights_m", "kept", "words"),
+    [
+        ((320.5, -9999.0, 321.0), (320.5, None, 321.0), "1 of 3 photos has no height (-9999: b.jpg)"),
+        (
+            (0.0, 319.0, 321.0),
+            (None, 319.0, 321.0),
+            "1 of 3 photos has no height (0 where the others are 319 to 321: a",
+        ),
+        (
+            (0.0, 0.0, 321.0),
+            (None, None, 321.0),
+            "2 of 3 photos have no height (0 where the others are 321 to 321: a.jpg",
+        ),
+        ((-32768.0, 320.0, 9999.0), (None, 320.0, None), "2 of 3 photos have no height (-32768: a.jpg; 9999 where"),
+        ((0.0, 0.0, 0.0), (None, None, None), "Tags: all heights are 0"),
+        ((0.5, 0.0, -0.5), (0.5, 0.0, -0.5), "Tags: the height 0 of b.jpg is used"),
+        ((-12.0, 40.0, 320.0), (-12.0, 40.0, 320.0), ""),
+    ],
+)
+def test_heights_in_tags_that_are_none_are_named_and_the_place_stays(
+    tmp_path: Path, heights_m: tuple[float, ...], kept: tuple[float | None, ...], words: str
+):
+    for name, z_m in zip(("a.jpg", "b.jpg", "c.jpg"), heights_m, strict=True):
+        exif = Image.Exif()
+        gps = {GPS.GPSLatitude: (47.0, 0.0, 0.0), GPS.GPSLongitude: (8.0, 0.0, 0.0)}
+        gps |= {GPS.GPSAltitude: abs(z_m), GPS.GPSAltitudeRef: b"\1" if z_m < 0 else b"\0"}
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps | {GPS.GPSLatitudeRef: "N", GPS.GPSLongitudeRef: "E"})
+        Image.new("L", (40, 30), int(z_m) % 200).save(tmp_path / name, exif=exif, comment=name)
+    outputs = run(tmp_path)
+    positions = [photo.position for photo in outputs.photos]
+    assert tuple(position and position.z_m for position in positions) == kept
+    assert all(position and position.y == 47.0 for position in positions)
+    notes = [note for note in outputs.notes if note.startswith("Tags: ")]
+    assert words in notes[0] if words else not notes
+
+
+@pytest.mark.parametrize(
     ("photo", "mask"),
     [
         ("a.jpg", "a_mask.png"),
@@ -258,6 +295,12 @@ def test_one_finding_that_differs_in_its_figures_alone_is_one_line(tmp_path: Pat
         ("a.jpg", "masks/a.jpg.png"),
         ("a.jpg", "Masks/a.png"),
         ("a.jpg", "masks/a_mask.tif"),
+        ("a.jpg", "a.mask.png"),
+        ("a.jpg", "a.jpg.mask.png"),
+        ("a.jpg", "a-Mask.png"),
+        ("a.jpg", "mask_a.png"),
+        ("a.jpg", "_masks/a.png"),
+        ("sub/a.jpg", "sub/flight1_masks/a.png"),
         ("sub/a.jpg", "masks/sub/a.jpg.png"),
         ("sub/a.jpg", "sub/masks/a.png"),
         ("images/a.jpg", "masks/a.jpg.png"),
@@ -270,12 +313,10 @@ def test_a_mask_belongs_to_its_photo_and_is_no_photo(tmp_path: Path, photo: str,
     Image.new("L", (500, 333), 255).save(tmp_path / mask)
     outputs = run(tmp_path)
     assert {p.name: p.mask and p.mask.name for p in outputs.photos} == {photo: mask, "other.jpg": None}
-    assert outputs.notes[0] == (
-        f"1 of 2 photos have a mask ({photo}: {mask}, ...): no features are taken where it is black."
-    )
+    assert outputs.notes[0] == (f"1 of 2 photos has a mask ({photo}: {mask}): no features are taken where it is black.")
 
 
-@pytest.mark.parametrize("mask", ["b_mask.png", "masks/b.jpg.png", "masks/readme.png"])
+@pytest.mark.parametrize("mask", ["b_mask.png", "masks/b.jpg.png", "masks/readme.png", "mask.png", "b.mask.png"])
 def test_a_mask_of_no_photo_is_passed_over_and_named(tmp_path: Path, mask: str):
     write(tmp_path / "a.jpg")
     (tmp_path / mask).parent.mkdir(parents=True, exist_ok=True)

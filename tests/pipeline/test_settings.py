@@ -106,7 +106,7 @@ def test_a_toml_changes_what_it_names_and_nothing_else(tmp_path):
         ("match = 3\n", r"a\.toml: no section 'match'"),
         ("[match]\nmin_inliers = 12.5\n", r"a\.toml: match\.min_inliers=12\.5: give a whole number"),
         ("[match]\nratio = [1]\n", r"a\.toml: match\.ratio=\[1\]: give a number"),
-        ("[match\n", r"a\.toml: is no TOML .*line 1"),
+        ("[match\n", r"a\.toml: is not valid TOML .*line 1"),
     ],
 )
 def test_a_bad_toml_is_refused_with_the_file_and_what_is_allowed(tmp_path, text, message):

@@ -147,6 +147,8 @@ def cameras(folder: Path, *changes: dict) -> tuple[list[str], list[str]]:
         {"xmp": {"Camera:BandName": "NIR"}},
         {"xmp": {"sensefly:RigCameraIndex": "1"}},
         {"xmp": {"drone-dji:ImageSource": "ZoomCamera"}},
+        {"xmp": {"drone-dji:DroneSerialNumber": "1581B"}, "exif": {BASE.BodySerialNumber: ""}},
+        {"xmp": {"drone-parrot:SerialNumber": "PI0402"}, "exif": {BASE.BodySerialNumber: "000"}},
         {"xmp": {"Camera:PerspectiveFocalLength": "1500", "Camera:PerspectiveFocalLengthUnits": "pixel"}},
         {"model": "Multi 2"},
     ],
@@ -177,6 +179,15 @@ def test_rounding_and_spelling_tell_no_cameras_apart(tmp_path: Path, change: dic
     names, notes = cameras(tmp_path, stated, stated, {**change, "exif": {**stated["exif"], **change.get("exif", {})}})
     assert set(names) == {"DJI Multi, serial 17, 5.0-25.0 mm, 4.5 mm, 400x300"}
     assert all("written in 2 ways and counts as one: 'DJI Multi, serial 17, 5.0-25.0 mm' (2) and" in n for n in notes)
+
+
+def test_two_drones_of_one_model_are_two_cameras_where_no_camera_has_a_serial_number(tmp_path: Path):
+    drones = [{"xmp": {"drone-dji:DroneSerialNumber": serial}} for serial in ("1581A", "1581B", "1581A", "0")]
+    unnamed = [{**drone, "exif": {BASE.BodySerialNumber: "0"}} for drone in drones]
+    assert [name.split(", ")[1] for name in cameras(tmp_path, *unnamed)[0]] == [
+        "drone 1581A", "drone 1581B", "drone 1581A", "5.0-25.0 mm"
+    ]  # fmt: skip
+    assert len(set(cameras(tmp_path, *drones)[0])) == 1  # one camera that two drones carried
 
 
 def test_bands_of_a_rig_and_zooms_are_named_after_what_tells_them_apart(tmp_path: Path):

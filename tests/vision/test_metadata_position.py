@@ -106,6 +106,31 @@ def test_finer_position_of_xmp_is_taken_only_where_exif_agrees(tmp_path: Path):
     assert "XMP 47.5120000" in " ".join(photo.notes)
 
 
+@pytest.mark.parametrize(
+    ("seconds", "in_xmp", "y", "words"),
+    [
+        ((36.0, 0.0), "47.5101200000", 47.51012, ""),  # whole seconds, 15 m
+        ((36.2, 0.3), "47.510053", 47.510053, ""),
+        ((36.0, 0.0), "47.5103", 47.51, "XMP 47.5103000"),
+        ((36.1234, 0.4321), "47.5100643", 47.5100342778, "XMP 47.5100643"),  # 3 m, as after post-processing
+        ((36.1234, 0.4321), "47.510034", 47.510034, ""),
+        ((36.1234, 0.4321), "47.5100", 47.5100342778, ""),  # XMP's own digits explain it
+        ((36.1234, 0.4321), "47.51", 47.5100342778, ""),
+        ((36.1234, 0.4321), "47.52", 47.5100342778, "XMP 47.5200000"),
+    ],
+)
+def test_positions_of_exif_and_xmp_differ_by_no_more_than_their_digits_or_are_named(
+    tmp_path: Path, seconds: tuple[float, float], in_xmp: str, y: float, words: str
+):
+    angles = {GPS.GPSLatitude: (47.0, 30.0, seconds[0]), GPS.GPSLongitude: (8.0, 15.0, seconds[1])}
+    digits = len(in_xmp.partition(".")[2])
+    xmp = {"drone-dji:GpsLatitude": in_xmp, "drone-dji:GpsLongitude": f"{8.25 + seconds[1] / 3600:.{digits}f}"}
+    photo = tagged(tmp_path, gps={**NORTH_EAST, **angles}, xmp=xmp)
+    assert photo.position is not None and photo.position.y == pytest.approx(y, abs=1e-9)
+    notes = [note for note in photo.notes if "XMP" in note]
+    assert (words in " ".join(notes)) if words else not notes, notes
+
+
 def test_position_in_xmp_alone(tmp_path: Path):
     xmp = {"drone:GpsLatitude": "-33.5", "drone:GpsLongtitude": "-70.25", "drone:RelativeAltitude": "60"}
     photo = tagged(tmp_path, make="Autel Robotics", model="XT705", xmp=xmp)
@@ -209,6 +234,15 @@ def test_a_southern_latitude_is_taken_from_xmp_too(tmp_path: Path):
         (431.5, 0, {"drone-dji:AbsoluteAltitude": "+431.70"}, 431.5, "0.20 m below that of XMP's AbsoluteAltitude"),
         (431.52, 0, {"drone-dji:AbsoluteAltitude": "+399.17"}, 431.52, "32.35 m above that of XMP's AbsoluteAltitude"),
         (431.0, 0, {"drone-dji:AbsoluteAltitude": "+431.70"}, 431.7, ""),
+        (0.0, 0, {"drone-dji:AbsoluteAltitude": "+431.70"}, 431.7, "EXIF is 0, that of XMP's AbsoluteAltitude 431.7 m"),
+        (0.0, 0, {"drone-dji:AbsoluteAltitude": "+30.00"}, 0.0, "30.00 m below that of XMP's AbsoluteAltitude: they"),
+        (
+            320.55,
+            0,
+            {"drone-dji:AbsoluteAltitude": "+1051.67"},
+            320.55,
+            "XMP's AbsoluteAltitude: one is wrong; that of",
+        ),
         (431.5, 1, {"exif:GPSAltitude": "863/2", "exif:GPSAltitudeRef": "0"}, 431.5, "XMP's exif:GPSAltitude puts it"),
         (431.5, None, {"exif:GPSAltitude": "863/2", "exif:GPSAltitudeRef": "1"}, -431.5, "the sign of its height"),
         (431.5, 1, {"exif:GPSAltitude": "863/2"}, -431.5, ""),

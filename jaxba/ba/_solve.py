@@ -90,7 +90,7 @@ def solve(
         ("adjoint", adjoint, get_args(Adjoint)),
         ("dtype", _name_of(dtype), ("float64", "float32")),
     ):
-        if not isinstance(value, str) or value not in choices:
+        if value not in choices:
             raise JaxbaError(f"solve: {name} {value!r}: choose one of {', '.join(choices)}.")
     if is_traced((ftol, xtol, gtol, max_nfev)):
         raise JaxbaError("solve: ftol, xtol, gtol or max_nfev is traced, as arguments of jit are; give numbers.")

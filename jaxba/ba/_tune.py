@@ -101,10 +101,6 @@ def tune(
         raise JaxbaError("tune needs optax, which is not installed: pip install 'jaxba[tune]'.") from error
     if (check_points is None) == (hold_out is None):
         raise JaxbaError("tune: give check_points or hold_out, one of them: the data to be judged by.")
-    if hold_out is not None:
-        require_number("tune: hold_out", hold_out, 1e-9, 1 - 1e-9, "give a share of the observations, such as 0.1")
-    elif not isinstance(check_points, tuple | list) or len(check_points) != 2:
-        raise JaxbaError("tune: check_points is no pair; give the indices of the points and their coordinates.")
     for name, count, least in (("steps", steps, 1.0), ("starts", starts, 1.0), ("seed", seed, 0.0)):
         cure = f"give a whole number, {least:g} or more"
         require_number(f"tune: {name}", count, least, 2.0**31 - 1, cure, whole=True)
@@ -288,6 +284,8 @@ def _held_out_score(
     problem: Problem, share: float, rng: np.random.Generator
 ) -> tuple[Problem, Callable[[Solution], Float[Array, ""]]]:
     """Return the problem without the observations held out, and their score."""
+    if not 0 < share < 1:
+        raise JaxbaError(f"tune: hold_out={share:g}: give a share of the observations, such as 0.1.")
     seen = problem.observations
     image, point = np.asarray(seen.image_index), np.asarray(seen.point_index)
     order = rng.permutation(len(point))

@@ -49,15 +49,12 @@ def test_a_solver_of_ones_own_is_checked(make: Any, name: str, value: float):
     [
         (solve_with(dtype=np.int32), "dtype 'int32': choose one of float64, float32"),
         (solve_with(dtype=None), "dtype 'None': choose"),
-        (solve_with(method=np.array(["lm", "dogleg"])), "method array.*: choose one of lm, dogleg"),
         (solve_with(dtype="double precision"), "dtype 'double precision': choose"),
         (lambda: jaxba.make_plan(PROBLEM, spare=-0.5), "spare is -0.5; give a share"),
         (lambda: jaxba.solve_and_reject(PROBLEM, rounds=-1), "rounds is -1; give a whole number"),
         (lambda: jaxba.solve_and_reject(PROBLEM, mad_factor=np.nan), "mad_factor is nan; give a positive"),
         (lambda: quality(PROBLEM, mad_factor=-1.0), "mad_factor is -1; give a positive"),
         (lambda: quality(PROBLEM, np.ones(3, bool)), r"used: a mask of shape \(3,\)"),
-        (lambda: jaxba.tune(PROBLEM, loss=jaxba.Huber(1.0), hold_out="x"), "hold_out is 'x', which is no number"),
-        (lambda: jaxba.tune(PROBLEM, loss=jaxba.Huber(1.0), check_points=[3]), "check_points is no pair"),  # pyright: ignore
         (lambda: jaxba.check_gradients(PROBLEM, tolerance=np.inf), "tolerance is inf; give a positive"),
     ],
 )

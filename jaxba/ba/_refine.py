@@ -26,7 +26,7 @@ from jaxba.geometry import Linear
 
 _NEAR_BEND = 0.9
 _SWEEPS, _ROBUST_SWEEPS = 2, 6
-_OUTWARD = 10.0
+_OUTWARD = 10.0  # with 3 or 5 far points take up to three times the steps, with 100 they end at a higher cost
 
 
 def refine_points(
@@ -67,7 +67,8 @@ def move_points(
 
     To first order this is `points + step`. But what a camera sees of a far point is nearly linear in its inverse
     distance and far from linear in its distance ("inverse depth", Montiel et al. 2006): a step that would take the
-    point behind the camera halves or thirds its distance, and none multiplies it by more than `_OUTWARD`.
+    point behind the camera halves or thirds its distance, and none multiplies it by more than `_OUTWARD`. Ten points at
+    1e8 m in a block of 20 images take 11 steps so, and 118 by addition.
     """
     origin = rows_of(unknowns.poses.center, system.point_image)
     ray = unknowns.points - origin

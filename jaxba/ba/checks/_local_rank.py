@@ -16,7 +16,7 @@ a point, a step (w, v) turns the ray by P (w x u + v / d), `P = I - u u^T`, and
     S = sum over images of K^T K - K^T J (J^T J)^+ J^T K,  and the rows of priors on intrinsics
 
 Cost: 500k observations take 60 ms for the poses. Of each camera a few images with the most observations are looked at
-for its intrinsics, which takes 30 ms; where they leave something open, all of them.
+for its intrinsics, which takes 50 ms; where they leave something open, all of them.
 """
 
 import dataclasses

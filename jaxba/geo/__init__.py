@@ -20,12 +20,12 @@ from jaxba.geo._heights import HeightStep, height_step, list_heights
 from jaxba.geo._notes import UNTRUSTED, frame_notes, height_notes
 from jaxba.geo._operation import Operation, horizontal_operation
 from jaxba.geo._positions import Measured, measured_positions
-from jaxba.geo._readings import elsewhere, would_fit
+from jaxba.geo._readings import distance_m, elsewhere, would_fit
 
 __all__ = [
     "AS_PHOTOS", "UNTRUSTED", "HeightDrift", "HeightStep", "Judgement", "Measured", "Operation", "Surveyed",
-    "describe", "elsewhere", "frame_notes", "geodetic_from_local", "grid_from_local", "height_notes", "height_step",
-    "heights_above", "hold_against_tags", "horizontal_operation", "judge_positions", "list_heights",
+    "describe", "distance_m", "elsewhere", "frame_notes", "geodetic_from_local", "grid_from_local", "height_notes",
+    "height_step", "heights_above", "hold_against_tags", "horizontal_operation", "judge_positions", "list_heights",
     "local_attitudes", "local_frame", "local_from_geodetic", "local_from_projected", "measured_positions",
     "parse_crs", "projected_from_local", "surveyed_points", "target_crs", "utm_zone", "would_fit",
 ]  # fmt: skip

@@ -15,7 +15,7 @@ from jaxba.geo._crs import describe, parse_crs
 from jaxba.geo._extent import middle, refuse_wrong_place
 from jaxba.geo._heights import list_heights
 from jaxba.geo._positions import to_wgs84
-from jaxba.geo._readings import FOOT_M, median_m, rough_places, would_fit
+from jaxba.geo._readings import FOOT_M, distance_m, rough_places, would_fit
 from jaxba.scene import Photo, Position
 
 MIN_PHOTOS = 3
@@ -52,7 +52,7 @@ def hold_against_tags(photos: Sequence[Photo], max_distance_m: float) -> list[st
 
 def _against(photos: Sequence[Photo], text: str, max_distance_m: float) -> list[str]:
     listed, tagged = _columns([photo.position for photo in photos]), _columns([photo.tag_position for photo in photos])
-    away_m = median_m(*_places(text, listed[:, :2]), tagged[:, 0], tagged[:, 1])
+    away_m = float(np.median(distance_m(*_places(text, listed[:, :2]), tagged[:, 0], tagged[:, 1])))
     name, crs = _list_of(photos[0]), describe(parse_crs(text))
     of = f"the photos' own tags (median of {len(photos)})"
     if away_m > MISREAD_M:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
-from pyproj import CRS, Transformer
+from pyproj import CRS, Geod, Transformer
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_crs_info
 from pyproj.enums import PJType
@@ -17,7 +17,6 @@ from jaxba.geo._crs import describe, parse_crs, utm_zone
 from jaxba.geo._extent import middle
 
 FOOT_M = 0.3048
-EARTH_M = 6.371e6
 Reading = tuple[str, Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
 """The mistake undone, in words, and the longitude and latitude that follow."""
 
@@ -39,25 +38,31 @@ def would_fit(
     """
     place = middle(longitude_deg, latitude_deg)
     for readings in (elsewhere(crs, xy, place), _codes_around(xy, place)):
-        tried = [(words, median_m(lon, lat, longitude_deg, latitude_deg)) for words, lon, lat in readings]
+        tried = [
+            (words, float(np.median(distance_m(lon, lat, longitude_deg, latitude_deg)))) for words, lon, lat in readings
+        ]
         words, away_m = min(tried, key=lambda entry: round(entry[1], -1), default=("", np.inf))  # of equals, the first
         if away_m <= within_m:
             return words, round(away_m, 1)
     return None
 
 
-def median_m(
+def distance_m(
     lon: Float[np.ndarray, " points"],
     lat: Float[np.ndarray, " points"],
     other_lon: Float[np.ndarray, " points"],
     other_lat: Float[np.ndarray, " points"],
-) -> float:
-    """Return the median distance between places, metres on a sphere; a place that is none is infinitely far."""
-    first, second, up, other_up = np.radians(lon), np.radians(other_lon), np.radians(lat), np.radians(other_lat)
-    with np.errstate(invalid="ignore"):
-        half = np.sin((up - other_up) / 2) ** 2 + np.cos(up) * np.cos(other_up) * np.sin((first - second) / 2) ** 2
-        away = 2 * EARTH_M * np.arcsin(np.sqrt(np.clip(half, 0, 1)))
-    return float(np.median(np.where(np.isfinite(away), away, np.inf)))
+) -> Float[np.ndarray, " points"]:
+    """Return geodesic distances between places on WGS 84, metres; a place that is none on earth is infinitely far.
+
+    >>> distance_m(np.array([8.5, np.nan]), np.array([47.4, 0.0]), np.array([8.5, 0.0]), np.array([46.4, 0.0])).round()
+    array([111169.,     inf])
+    """
+    ends = np.stack([lon, lat, other_lon, other_lat])
+    known = np.isfinite(ends).all(axis=0) & (np.abs(ends[1::2]) <= 90).all(axis=0)
+    away = np.full(len(known), np.inf)
+    away[known] = Geod(ellps="WGS84").inv(*ends[:, known])[2]
+    return away
 
 
 def elsewhere(crs: str, xy: Float[np.ndarray, "points 2"], near: tuple[float, float]) -> list[Reading]:

@@ -92,10 +92,10 @@ def test_a_list_that_is_read_wrongly_is_refused_with_the_reading_that_fits(mista
 
 
 def test_a_list_that_no_mistake_explains_is_refused_with_both_cures():
-    with pytest.raises(JaxbaError, match=r"lie 111\.2 km from .*No usual mistake.*or raise crs.max_distance_km if"):
+    with pytest.raises(JaxbaError, match=r"lie 111\.1 km from .*No usual mistake.*or raise crs.max_distance_km if"):
         held(listed("EPSG:4326", flight((-93.2, 45.9)), flight(MINNESOTA)))
     said = held(listed("EPSG:4326", flight((-93.2, 45.9)), flight(MINNESOTA)), max_distance_m=2e5)
-    assert said == ["geo.txt: positions lie 111.2 km from those of the photos' own tags (median of 8)."]
+    assert said == ["geo.txt: positions lie 111.1 km from those of the photos' own tags (median of 8)."]
 
 
 def test_a_mistake_of_less_than_the_limit_is_refused_where_it_explains_the_distance():

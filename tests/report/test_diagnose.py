@@ -164,15 +164,14 @@ def test_a_solver_out_of_steps_with_a_high_cost_speaks_of_bad_input(made: Survey
 def test_swapped_axes_are_told_from_the_tags(made: Survey, tmp_path: Path):
     rows = [(name, y, x, z) for name, x, y, z in in_utm(places(made))]
     result = found(made.copy(tmp_path), until="crs", geotags=geo_txt(tmp_path / "geo.txt", "EPSG:32615", rows))
-    assert (
-        "its axes are swapped" in result["far off"].cause and "x (longitude, east) before y" in result["far off"].cure
-    )
+    assert "with x and y swapped it would be 0 m" in result["far off"].cause
+    assert result["far off"].cure == "Correct the list: x and y swapped."
 
 
 def test_a_wrong_zone_of_the_list_is_named(made: Survey, tmp_path: Path):
     geotags = geo_txt(tmp_path / "geo.txt", "EPSG:32616", in_utm(places(made)))
     result = found(made.copy(tmp_path), until="crs", geotags=geotags)
-    assert "EPSG:32615 fits" in result["far off"].cause
+    assert "with UTM zone 15N (EPSG:32615) it would be 0 m" in result["far off"].cause
 
 
 def test_a_target_crs_of_another_zone_is_said_with_its_area(made: Survey, tmp_path: Path):

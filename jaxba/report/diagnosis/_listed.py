@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from pyproj import Geod, Transformer
+from pyproj import Transformer
 from pyproj.exceptions import ProjError
 
+from jaxba.geo import distance_m
 from jaxba.report._recorded import Recorded
 from jaxba.scene import Photo, Position
 
@@ -46,19 +47,5 @@ def against_tags(case: Recorded) -> Against | None:
     first, second = (np.array([wgs84(position) for position in entry]) for entry in (listed, tagged))
     up = [np.nan if a.z_m is None or b.z_m is None else a.z_m - b.z_m for a, b in zip(listed, tagged, strict=True)]
     return Against(
-        photos=photos, listed=listed, tagged=tagged, away_m=apart_m(first, second), up_m=np.array(up, float)
+        photos=photos, listed=listed, tagged=tagged, away_m=distance_m(*first.T, *second.T), up_m=np.array(up, float)
     )  # fmt: skip
-
-
-def apart_m(first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Return how far places are apart; infinity where one of them is none on earth."""
-    valid = np.isfinite(first).all(axis=1) & (np.abs(first[:, 1]) <= 90)
-    away = np.full(len(first), np.inf)
-    if valid.any():
-        ends = first[valid, 0], first[valid, 1], second[valid, 0], second[valid, 1]
-        away[valid] = Geod(ellps="WGS84").inv(*ends)[2]
-    return away
-
-
-def moved(position: Position, x: float, y: float, crs: str | None = None) -> Position:
-    return Position(crs=crs or position.crs, x=x, y=y)

@@ -3,18 +3,16 @@ itself. Where a list replaces the photos' tags, they are held against it."""
 
 import numpy as np
 from jaxtyping import Bool, Float
-from pyproj import CRS
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._words import some
 from jaxba.report._recorded import Recorded
 from jaxba.report.diagnosis._adjustment import bounds_reached, has_large_errors
 from jaxba.report.diagnosis._diagnosis import Diagnosis
-from jaxba.report.diagnosis._listed import Against, against_tags, apart_m, moved, wgs84
+from jaxba.report.diagnosis._listed import Against, against_tags, wgs84
 from jaxba.scene import Position
 
 _FAR_M = 100.0
-_AGREES_M = 60.0  # a plain receiver with a bad day
 _DATUM_M = 8.0  # between height systems, or horizontal datums; a receiver's heights differ by less within a flight
 _STEADY = 0.3  # scatter of an offset over it: an offset in common
 _OUTLIERS = 0.1
@@ -277,22 +275,19 @@ def _against_photos(case: Recorded, figures: dict[str, object]) -> list[str]:
 
 
 def _what_would_fit(found: Against) -> tuple[str, str]:
-    """Return why positions are off, as far as swapped axes or another zone explain it, and the cure."""
-    second = np.array([wgs84(position) for position in found.tagged])
-    crs = CRS(found.listed[0].crs)
-    swapped = np.array([wgs84(moved(position, position.y, position.x)) for position in found.listed])
-    if np.median(apart_m(swapped, second)) < _AGREES_M:
-        return "its axes are swapped", "Write x (longitude, east) before y (latitude, north) in the list."
-    if crs.utm_zone is not None:
-        for zone in range(1, 61):
-            code = f"EPSG:{(32600 if crs.utm_zone.endswith('N') else 32700) + zone}"
-            other = np.array([wgs84(moved(p, p.x, p.y, code)) for p in found.listed])
-            if np.median(apart_m(other, second)) < _AGREES_M:
-                return f"it is the wrong zone, {code} fits", f"Write {code} for {found.listed[0].crs} into the list."
-    return (
-        "neither swapped axes nor another UTM zone explains it",
-        "Compare the list with the photos' tags, row by row.",
-    )
+    """Return why positions are off, as far as a usual mistake explains it, and the cure."""
+    from jaxba import geo
+
+    tagged = np.array([wgs84(position) for position in found.tagged])
+    of_first = [k for k, position in enumerate(found.listed) if position.crs == found.listed[0].crs]
+    xy = np.array([(found.listed[k].x, found.listed[k].y) for k in of_first])
+    fit = geo.would_fit(found.listed[0].crs, xy, *tagged[of_first].T, within_m=_FAR_M)
+    if fit is None:
+        return (
+            "no usual mistake explains it (axes, degrees, feet, zone, hemisphere)",
+            "Compare the list with the photos' tags, row by row.",
+        )
+    return f"with {fit[0]} it would be {_length(fit[1])}", f"Correct the list: {fit[0]}."
 
 
 def _length(metres: float) -> str:

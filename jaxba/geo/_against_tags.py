@@ -34,26 +34,26 @@ def hold_against_tags(photos: Sequence[Photo], max_distance_m: float) -> list[st
     explains it; and for one without tags to hold it against whose middle its CRS is not made for.
     """
     notes: list[str] = []
-    listed = [photo for photo in photos if photo.position is not None and " line " in photo.position.source]
-    for text in sorted({photo.position.crs for photo in listed if photo.position is not None}):
+    listed = [photo for photo in photos if photo.position is not None and photo.position.list_name]
+    for name, text in sorted({(p.position.list_name, p.position.crs) for p in listed if p.position is not None}):
         of_crs = [photo for photo in listed if photo.position is not None and photo.position.crs == text]
         tagged = [photo for photo in of_crs if _is_place(photo.tag_position)]
         if len(tagged) >= min(MIN_PHOTOS, len(of_crs)):
-            notes += _against(tagged, text, max_distance_m)
+            notes += _against(tagged, text, name, max_distance_m)
             continue
         if tagged:
             notes.append(
-                f"{_list_of(of_crs[0])}: {len(tagged)} of its {len(of_crs)} photos have a position in their tags, too "
+                f"{name}: {len(tagged)} of its {len(of_crs)} photos have a position in their tags, too "
                 "few to hold the list against."
             )
-        _refuse_outside(of_crs, text)
+        _refuse_outside(of_crs, text, name)
     return notes
 
 
-def _against(photos: Sequence[Photo], text: str, max_distance_m: float) -> list[str]:
+def _against(photos: Sequence[Photo], text: str, name: str, max_distance_m: float) -> list[str]:
     listed, tagged = _columns([photo.position for photo in photos]), _columns([photo.tag_position for photo in photos])
     away_m = float(np.median(distance_m(*_places(text, listed[:, :2]), tagged[:, 0], tagged[:, 1])))
-    name, crs = _list_of(photos[0]), describe(parse_crs(text))
+    crs = describe(parse_crs(text))
     of = f"the photos' own tags (median of {len(photos)})"
     if away_m > MISREAD_M:
         within_m = max_distance_m if away_m > max_distance_m else MISREAD_SHARE * away_m
@@ -99,9 +99,9 @@ def _heights_apart(
     return [f"{name}: heights lie {abs(up_m):.1f} m {side} those of the photos' own tags (median). {why}."]
 
 
-def _refuse_outside(photos: Sequence[Photo], text: str) -> None:
+def _refuse_outside(photos: Sequence[Photo], text: str, name: str) -> None:
     """Refuse a list whose middle lies where its CRS is not made for: degrees or swapped axes in a projected one."""
-    crs, name = parse_crs(text), _list_of(photos[0])
+    crs = parse_crs(text)
     if not crs.is_projected:
         return
     xy = _columns([photo.position for photo in photos])[:, :2]
@@ -139,11 +139,6 @@ def _is_place(position: Position | None) -> bool:
 
 def _columns(positions: Sequence[Position | None]) -> Float[np.ndarray, "rows 3"]:
     return np.array([(p.x, p.y, np.nan if p.z_m is None else p.z_m) for p in positions if p is not None], float)
-
-
-def _list_of(photo: Photo) -> str:
-    """Return the list's name, of a source such as `geo.txt line 2`."""
-    return "positions" if photo.position is None else photo.position.source.rsplit(" line ", 1)[0]
 
 
 def _length(metres: float) -> str:

@@ -59,7 +59,7 @@ def distance_m(
     array([111169.,     inf])
     """
     ends = np.stack([lon, lat, other_lon, other_lat])
-    known = np.isfinite(ends).all(axis=0) & (np.abs(ends[1::2]) <= 90).all(axis=0)
+    known = np.asarray(np.isfinite(ends).all(axis=0) & (np.abs(ends[1::2]) <= 90).all(axis=0))
     away = np.full(len(known), np.inf)
     away[known] = Geod(ellps="WGS84").inv(*ends[:, known])[2]
     return away

@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 
 from jaxba._errors import JaxbaError
 from jaxba.io._geotags import Geotag, Geotags
-from jaxba.io._list_cells import has_image_suffix
+from jaxba.io._list_cells import has_image_suffix, some
 
 _MOST_NAMES = 50
 
@@ -42,15 +42,15 @@ def match_geotags(
     unknown = [name + like_photo(name, photos) for name in unknown]
     if not found:
         raise JaxbaError(
-            f"{name} lists none of the photos: it names {_some(unknown, 3)}, the folder holds {_some(photos, 3)}; "
+            f"{name} lists none of the photos: it names {some(unknown, 3)}, the folder holds {some(photos, 3)}; "
             "write the names as in the folder, or leave the list away."
         )
     notes = [f"{name} replaces the tags' positions of {len(found)} of {len(photos)} photos."]
     missing = [photo for photo in photos if photo not in found]
     if missing:
-        notes.append(f"{name} does not list {_some(missing)}: the tags stand.")
+        notes.append(f"{name} does not list {some(missing, _MOST_NAMES)}: the tags stand.")
     if unknown:
-        notes.append(f"{name} lists what is no usable photo: {_some(unknown)}.")
+        notes.append(f"{name} lists what is no usable photo: {some(unknown, _MOST_NAMES)}.")
     return found, [*notes, *geotags.notes]
 
 
@@ -115,7 +115,3 @@ def _letters(name: str) -> str:
     """Return the letters and digits of the last part of a name, without case and accents."""
     base = re.split(r"[/\\]", unicodedata.normalize("NFKD", name).casefold())[-1]
     return "".join(letter for letter in base if letter.isalnum())
-
-
-def _some(names: Sequence[str], most: int = _MOST_NAMES) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -111,13 +111,13 @@ def without_fillers(
     notes = []
     if reasons:
         count = sum(map(len, reasons.values()))
-        listed = "; ".join(f"{why}: {_some(found)}" for why, found in reasons.items())
+        listed = "; ".join(f"{why}: {some(found)}" for why, found in reasons.items())
         has = "has" if count == 1 else "have"
         zero = cure if any(reason.startswith("0 where") for reason in reasons) else ""
         notes.append(f"{name}: {count} of {len(z)} {kind}s {has} no height ({listed}){so}.{zero}")
     if zeros and sure:
         notes.append(
-            f"{name}: the height 0 of {_some(zeros)} is used, since others are near it ({min(sure):g} to "
+            f"{name}: the height 0 of {some(zeros)} is used, since others are near it ({min(sure):g} to "
             f"{max(sure):g}); write NaN where none was measured."
         )
     elif zeros:
@@ -166,5 +166,6 @@ def no_photos(name: str) -> bool:
     return False
 
 
-def _some(names: Sequence[str], most: int = 10) -> str:
+def some(names: Sequence[str], most: int = 10) -> str:
+    """Return the names, or the first ones and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

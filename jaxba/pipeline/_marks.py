@@ -35,6 +35,29 @@ class PhotoMarks:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Given:
+    """Marks as a list gives them.
+
+    - `photos`: of each mark. `size_px`: width and height of these as stored. `mark_width_px`: of those in which marks
+      were set, None where nobody says it. `name`: of the list.
+    """
+
+    xy_px: Float[np.ndarray, "marks 2"]
+    photos: Sequence[Photo]
+    mark_width_px: int | None
+    name: str
+
+    @property
+    def size_px(self) -> Float[np.ndarray, "marks 2"]:
+        return np.array([[photo.width_px, photo.height_px] for photo in self.photos], float)
+
+    @property
+    def orientation(self) -> Int[np.ndarray, " marks"]:
+        """Of the photos, by EXIF."""
+        return np.array([photo.orientation for photo in self.photos])
+
+
 def marks_in_photos(
     points: Sequence[SurveyedPoint],
     photos: Sequence[Photo],
@@ -88,21 +111,23 @@ def marks_in_photos(
         )
         for image, marked in unknown.items()
     ]
-    xy_px = np.array([[mark.x_px, mark.y_px] for mark in marks])
-    size_px = np.array([[photos[k].width_px, photos[k].height_px] for k in image], float)
-    marked = [photos[k] for k in image]
-    own = np.array([photo.orientation for photo in marked])
-    notes = []
+    given = _Given(
+        xy_px=np.array([[mark.x_px, mark.y_px] for mark in marks]),
+        photos=[photos[k] for k in image],
+        mark_width_px=mark_width_px,
+        name=name,
+    )
+    own, notes = given.orientation, []
     if orientation == "auto":
         seen_px = None if expected is None else expected(np.array(point), np.array(image))
-        notes = _refuse_turned(xy_px, size_px, marked, mark_width_px, name, seen_px)
+        notes = _refuse_turned(given, seen_px)
     turn = own if orientation == "exif" else np.full(len(own), int(orientation) if orientation.isdigit() else 1)
     if orientation not in ("auto", "stored"):
         how = "each photo's EXIF orientation" if orientation == "exif" else f"orientation {orientation}"
         notes.append(f"{name}: marks are turned back by {how} (control.mark_orientation={orientation}).")
-    xy_px, scaled = _on_grid(xy_px, size_px, marked, mark_width_px, name, turn)
+    xy_px, scaled = _on_grid(given, turn)
     notes += scaled
-    outside = _outside(xy_px, size_px)
+    outside = _outside(xy_px, given.size_px)
     for k in np.flatnonzero(outside):
         photo = photos[image[k]]
         left.append(
@@ -120,37 +145,23 @@ def marks_in_photos(
     )  # fmt: skip
 
 
-def _on_grid(
-    xy_px: Float[np.ndarray, "marks 2"],
-    size_px: Float[np.ndarray, "marks 2"],
-    photos: Sequence[Photo],
-    mark_width_px: int | None,
-    name: str,
-    turn: Int[np.ndarray, " marks"],
-) -> tuple[Float[np.ndarray, "marks 2"], list[str]]:
+def _on_grid(given: _Given, turn: Int[np.ndarray, " marks"]) -> tuple[Float[np.ndarray, "marks 2"], list[str]]:
     """Return marks that were set in photos shown under orientations, scaled, on the stored grid, and notes."""
-    scaled, notes = _scaled(xy_px, shown_size(size_px, turn), photos, mark_width_px, name, turn)
-    return on_stored_grid(scaled, size_px, turn), notes
+    scaled, notes = _scaled(given, turn)
+    return on_stored_grid(scaled, given.size_px, turn), notes
 
 
-def _refuse_turned(
-    xy_px: Float[np.ndarray, "marks 2"],
-    size_px: Float[np.ndarray, "marks 2"],
-    photos: Sequence[Photo],
-    mark_width_px: int | None,
-    name: str,
-    expected_px: Float[np.ndarray, "marks 2"] | None,
-) -> list[str]:
+def _refuse_turned(given: _Given, expected_px: Float[np.ndarray, "marks 2"] | None) -> list[str]:
     """Refuse marks that fit on turned photos alone; return notes on photos that viewers turn."""
 
     def placed(turn: Int[np.ndarray, " marks"]) -> Float[np.ndarray, "marks 2"] | None:
         try:
-            return _on_grid(xy_px, size_px, photos, mark_width_px, name, turn)[0]
+            return _on_grid(given, turn)[0]
         except JaxbaError:  # they lie outside
             return None
 
-    own = np.array([photo.orientation for photo in photos])
-    best, away_px = best_turn(placed, own, expected_px, float(size_px.max()))
+    name, photos = given.name, given.photos
+    best, away_px = best_turn(placed, given.orientation, expected_px, float(given.size_px.max()))
     turned = sorted({photo.name for photo in photos if photo.orientation > 1})
     are = f"{len(turned)} marked photos have an EXIF orientation other than 1"
     if turned:
@@ -199,19 +210,11 @@ def _outside(xy_px: Float[np.ndarray, "marks 2"], size_px: Float[np.ndarray, "ma
     return np.any((xy_px < 0) | (xy_px > size_px), axis=1)
 
 
-def _scaled(
-    xy_px: Float[np.ndarray, "marks 2"],
-    size_px: Float[np.ndarray, "marks 2"],
-    photos: Sequence[Photo],
-    mark_width_px: int | None,
-    name: str,
-    turn: Int[np.ndarray, " marks"],
-) -> tuple[Float[np.ndarray, "marks 2"], list[str]]:
-    """Return marks on the photos' own pixels, and how they got there.
-
-    - `photos`: of each mark. `turn`: the EXIF orientation under which they were shown, `size_px` their size then.
-    """
-    first = photos[0]
+def _scaled(given: _Given, turn: Int[np.ndarray, " marks"]) -> tuple[Float[np.ndarray, "marks 2"], list[str]]:
+    """Return marks on the pixels of the photos as shown under the orientations `turn`, and how they got there."""
+    xy_px, name, mark_width_px = given.xy_px, given.name, given.mark_width_px
+    size_px = shown_size(given.size_px, turn)
+    first = given.photos[0]
     width, height = size_px[0].astype(int)
     if mark_width_px is not None:
         factor = size_px[:, :1] / mark_width_px
@@ -219,7 +222,7 @@ def _scaled(
         return xy_px * factor, [f"{note}of {width} px (control.mark_width_px)."]
     outside = _outside(xy_px, size_px)
     count, total = int(outside.sum()), len(xy_px)
-    original = np.array([photo.original_size_px or (np.nan, np.nan) for photo in photos], float)
+    original = np.array([photo.original_size_px or (np.nan, np.nan) for photo in given.photos], float)
     original = shown_size(original, turn)
     other = np.isfinite(original).all(axis=1) & (np.abs(original / size_px - 1) > 1e-6).any(axis=1)
     if count <= _OUTSIDE * total:

@@ -104,7 +104,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     if geotags is not None:
         entries, found = match_geotags(geotags, [photo.name for photo in photos], inputs.geotags_name)
         entries, told = _with_heights_in_metres(entries, inputs.geotags_name)
-        photos = [_tagged(photo, entries.get(photo.name), geotags.is_nadir_zero) for photo in photos]
+        photos = [
+            _tagged(photo, entries.get(photo.name), geotags.is_nadir_zero, inputs.geotags_name) for photo in photos
+        ]
         notes += [*found, *told]
     left_out.sort(key=lambda left: left.name)
     return Outputs(photos=tuple(photos), left_out=tuple(left_out), notes=tuple(notes))
@@ -213,7 +215,7 @@ def _with_heights_in_metres(entries: dict[str, Geotag], name: str) -> tuple[dict
     return changed, notes
 
 
-def _tagged(photo: Photo, entry: Geotag | None, is_nadir_zero: bool) -> Photo:
+def _tagged(photo: Photo, entry: Geotag | None, is_nadir_zero: bool, name: str) -> Photo:
     if entry is None:
         return photo
     relative_m = photo.position.relative_altitude_m if photo.position else None
@@ -222,5 +224,5 @@ def _tagged(photo: Photo, entry: Geotag | None, is_nadir_zero: bool) -> Photo:
         attitude = attitude_from_nadir_body(*angles)
     elif angles is not None:
         attitude = Attitude(yaw_deg=angles[0], pitch_deg=angles[1], roll_deg=angles[2])
-    position = dataclasses.replace(entry.position, relative_altitude_m=relative_m)
+    position = dataclasses.replace(entry.position, relative_altitude_m=relative_m, list_name=name)
     return dataclasses.replace(photo, position=position, tag_position=photo.position, attitude=attitude)

@@ -36,7 +36,8 @@ class Position:
     - `z_m`: height; `height_kind` says above what. Metres.
     - `relative_altitude_m`: above the take-off point, never mixed with `z_m`.
     - `std_h_m`, `std_v_m`: accuracy as the photo or list states it, horizontal (an axis) and vertical.
-    - `fix`: of the GNSS receiver. `source`: where it was read, for messages.
+    - `fix`: of the GNSS receiver. `source`: where it was read, for messages. `list_name`: of the list that gives it in
+      place of the tags; empty where these do.
     """
 
     crs: str = "EPSG:4326"
@@ -49,6 +50,7 @@ class Position:
     std_v_m: float | None = None
     fix: Fix = "unknown"
     source: str = "EXIF"
+    list_name: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,7 +30,7 @@ def listed(crs: str, xyz: np.ndarray, tags: np.ndarray) -> list[Photo]:
     """Return photos that a list replaces the positions of; NaN where their tags have none."""
     photos = []
     for k, (x, y, z) in enumerate(xyz):
-        of_list = photo(k, Position(crs=crs, x=x, y=y, z_m=z, source=f"geo.txt line {k + 2}"))
+        of_list = photo(k, Position(crs=crs, x=x, y=y, z_m=z, source=f"geo.txt line {k + 2}", list_name="geo.txt"))
         lon, lat, height = tags[k]
         own = None if np.isnan(lon) else Position(x=lon, y=lat, z_m=height)
         photos.append(Photo(**{**vars(of_list), "tag_position": own}))

@@ -18,6 +18,7 @@ CLOUDS = ("cloud.csv", "cloud.ply", "cloud.laz")
 SITES = ("cameras.gpkg", "cameras.geojson")
 DESCRIPTION, FRAME, TEXT, BINARY = "cloud.csv.json", "colmap/frame.json", "colmap/text", "colmap/binary"
 OPENSFM, TILE, CONTROL = "reconstruction.json", "tile.npz", "control.csv"
+_WORDS_OF_CONTROL = ("name", "role", "suspect", "reason")  # the other columns hold numbers
 _DESCRIBED = ("points", "EPSG", "code", "crs", "unit", "height_unit", "heights", "columns", "wkt")
 _CURE = "it was changed or damaged: run again to export it anew"
 
@@ -80,6 +81,13 @@ def _sites(path: Path) -> Any:
     from jaxba.io._read_sites import read_sites
 
     return read_sites(path)
+
+
+def _num_columns(table: str) -> int:
+    """Return how many columns a table of `jaxba.io` describes."""
+    from jaxba import io
+
+    return len(getattr(io, table))
 
 
 def _model(folder: Path) -> Any:
@@ -176,8 +184,9 @@ def _control(path: Path) -> list[dict[str, str]]:
         cells = dict(zip(header, row, strict=True))
         if cells["role"] not in ("control", "check"):
             raise JaxbaError(f"{path}, line {number}: role is {cells['role']!r}, not control or check; {_CURE}.")
-        for name in header[2:-2]:
-            _number(path, number, name, cells[name])
+        for name, text in cells.items():
+            if name not in _WORDS_OF_CONTROL:
+                _number(path, number, name, text)
         table.append(cells)
     return table
 
@@ -205,17 +214,26 @@ def _model_figure(found: Any) -> str:
 
 
 _READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Any], str]]] = {
-    "cloud.csv": (_clouds("read_csv_cloud"), _cloud_figure("13 columns")),
+    "cloud.csv": (
+        _clouds("read_csv_cloud"),
+        lambda found: f"{_num_columns('CLOUD_COLUMNS')} columns, {found.cloud.num_points:,} points",
+    ),
     DESCRIPTION: (_description, lambda found: f"{len(found['columns'])} columns described, {found['points']:,} points"),
     "cloud.ply": (_clouds("read_ply"), _cloud_figure("9 properties")),
     "cloud.laz": (_clouds("read_las"), _cloud_figure("LAS 1.4, point format 7, 3 extra dimensions")),
-    "cameras.gpkg": (_sites, lambda found: f"layer cameras, 19 columns, {len(found.name):,} photos"),
-    "cameras.geojson": (_sites, lambda found: f"19 columns, {len(found.name):,} photos"),
+    "cameras.gpkg": (
+        _sites,
+        lambda found: f"layer cameras, {_num_columns('SITE_COLUMNS')} columns, {len(found.name):,} photos",
+    ),
+    "cameras.geojson": (_sites, lambda found: f"{_num_columns('SITE_COLUMNS')} columns, {len(found.name):,} photos"),
     TEXT: (_model, _model_figure),
     BINARY: (_binary, lambda found: f"{found.num_images:,} images, {found.num_points:,} points"),
     FRAME: (_frame, lambda found: "no place on earth" if found is None else f"origin and {found.crs}"),
     OPENSFM: (_opensfm, lambda found: f"{len(found['shots']):,} shots, {len(found['points']):,} points"),
-    CONTROL: (_control, lambda found: f"22 columns, {len(found):,} control and check points"),
+    CONTROL: (
+        _control,
+        lambda found: f"{len(found[0]) if found else 0} columns, {len(found):,} control and check points",
+    ),
     TILE: (_tile, lambda found: f"{found.num_images:,} images, {found.num_points:,} points"),
 }
 """How each file, or folder of files, is read, and its figure."""

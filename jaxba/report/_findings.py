@@ -8,6 +8,7 @@ out of a sentence.
 import math
 from collections.abc import Callable, Sequence
 
+from jaxba.engine._words import many
 from jaxba.report._control_findings import CONTROL_WORDS, along_axes
 from jaxba.scene import Finding
 
@@ -70,10 +71,10 @@ def _edges_left_out(names: Sequence[str], matches: Sequence[int], median_px: Seq
         for name, count, error in zip(names, matches, median_px, strict=True)
     ]
     left = len(rows) - _MOST_ROWS
-    more = [f"  and {left} more: summary.json, adjust.edges_left_out"] if left > 0 else []
+    more = [f"  and {left:,} more: summary.json, adjust.edges_left_out"] if left > 0 else []
     were, their, photos = ("was", "its", "its photos") if len(rows) == 1 else ("were", "their", "photos of the worst")
     first = (
-        f"{_many(len(rows), 'edge')} {were} left out, since {their} matches are off by over {limit_px:g} px in the "
+        f"{many(len(rows), 'edge')} {were} left out, since {their} matches are off by over {limit_px:g} px in the "
         f"median. Look at {photos} for repeated patterns or movement."
     )
     return "\n".join([first, *rows[:_MOST_ROWS], *more])
@@ -85,7 +86,7 @@ def _image_lost(name: str, reason: str) -> str:
 
 def _few_points(names: Sequence[str], points: Sequence[int], least: int) -> str:
     return (
-        f"{_many(len(names), 'image')} with fewer than {least} points, so weakly placed: "
+        f"{many(len(names), 'image')} with fewer than {least} points, so weakly placed: "
         f"{_named(names, [f'{count} points' for count in points])}. More overlap or features cure it."
     )
 
@@ -96,7 +97,7 @@ def _positions_contradict(
     figures = [along_axes(row, "+.1f") for row in residual_m]
     verb, count = ("contradicts", "counts") if len(names) == 1 else ("contradict", "count")
     return (
-        f"{_many(len(names), 'measured position')} of {measured} {verb} the photos by more than {sigmas:g} robust "
+        f"{many(len(names), 'measured position')} of {measured:,} {verb} the photos by more than {sigmas:g} robust "
         f"sigmas and hardly {count} (adjusted minus measured): {_named(names, figures)}."
     )
 
@@ -181,7 +182,7 @@ def _principal_point_off(camera: str, parameter: str, value: float, middle: floa
 
 def _weak_positions(names: Sequence[str], std_m: Sequence[float], median_m: float) -> str:
     return (
-        f"{_many(len(names), 'image')} with a position sigma over five times the median of {median_m:.2g} m: "
+        f"{many(len(names), 'image')} with a position sigma over five times the median of {median_m:.2g} m: "
         f"{_named(names, [f'{std:.2g} m' for std in std_m])}."
     )
 
@@ -194,14 +195,9 @@ def _common_offset(median_m: float, receiver_std_m: float) -> str:
     )
 
 
-def _many(count: int, noun: str) -> str:
-    """Return the count with its noun; without separators, as all other numbers here."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def _named(names: Sequence[str], figures: Sequence[str]) -> str:
     shown = [f"{name} ({figure})" for name, figure in zip(names, figures, strict=True)]
-    more = f" and {len(shown) - _MOST_NAMES} more" if len(shown) > _MOST_NAMES else ""
+    more = f" and {len(shown) - _MOST_NAMES:,} more" if len(shown) > _MOST_NAMES else ""
     return ", ".join(shown[:_MOST_NAMES]) + more
 
 

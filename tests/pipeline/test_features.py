@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from small_survey import Survey
 
 from jaxba import JaxbaError
-from jaxba.pipeline import features
+from jaxba.pipeline import PIPELINE, _stages, features
+from jaxba.report import recorded
 from jaxba.scene import Photo, PhotoFile
 
 
@@ -104,3 +106,18 @@ def test_a_mask_over_all_of_a_photo_is_named_as_the_reason(tmp_path: Path) -> No
     photo = replace(photo_of(tmp_path / "noise.png", 320, 240), mask=file)
     found = features.run(features.Inputs(photo=photo), features.Params()).features
     assert found.num_keypoints == 0 and "100% of the photo is masked" in found.notes
+
+
+def test_another_mask_reruns_its_own_photo_alone(made: Survey) -> None:
+    done = recorded(made.project, PIPELINE).done
+    first, *others = done.photos
+
+    def identities(sha256: str | None) -> dict[str, object]:
+        mask = None if sha256 is None else PhotoFile(name="m.png", path=Path("m.png"), sha256=sha256)
+        photos = (replace(first, mask=mask), *others)
+        items = _stages._features(replace(done, metadata=replace(done.metadata, photos=photos)))
+        return {item.name: item.identity for item in items}
+
+    without, black, other = identities(None), identities("a" * 64), identities("b" * 64)
+    changed = {name for name in without if without[name] != black[name] or black[name] != other[name]}
+    assert changed == {first.name} and len({str(of[first.name]) for of in (without, black, other)}) == 3

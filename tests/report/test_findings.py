@@ -338,9 +338,9 @@ def test_more_than_ten_photos_are_counted():
     assert sentence(finding).endswith("p9 (0.5 m) and 2 more.")
 
 
-def test_photos_are_counted_without_separators():
+def test_counts_of_a_sentence_are_written_alike():
     many = Finding.of("few points", names=["a"] * 1200, points=[7] * 1200, least=20)
-    assert sentence(many).startswith("1200 images with fewer than 20 points") and " and 1190 more." in sentence(many)
+    assert sentence(many).startswith("1,200 images with fewer than 20 points") and " and 1,190 more." in sentence(many)
 
 
 def test_every_kind_that_can_be_found_has_words_and_a_case():

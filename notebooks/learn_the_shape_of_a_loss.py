@@ -79,7 +79,8 @@ for share in shares:
     axes[0].plot(huber[share], tuned[share], "o", label=f"{share:.0%} wrong")
 largest = max(max(h) for h in huber.values())
 axes[0].plot([0, largest], [0, largest], "k:", linewidth=1)
-axes[0].set(xlabel="Huber(1): check points, RMS (m)", ylabel="tuned: check points, RMS (m)", title=f"{len(seeds)} seeds each")
+axes[0].set(xlabel="Huber(1): check points, RMS (m)", ylabel="tuned: check points, RMS (m)")
+axes[0].set_title(f"{len(seeds)} seeds each")
 axes[0].legend()
 residual = np.linspace(0, 10, 200)
 losses = {"Huber(1)": jaxba.Huber(1.0)}

@@ -33,7 +33,7 @@ from jaxba.ba._hessian import hessian
 from jaxba.ba._linearise import Linearisation, cost, linearise
 from jaxba.ba._refine import refine_points
 from jaxba.ba._rows import rows_of
-from jaxba.ba._schur import Reduced, back_substitute, eliminate_points, reduce_vector
+from jaxba.ba._schur import Reduced, back_substitute, eliminate_points, one_for_fixed, reduce_vector
 from jaxba.ba._system import System, is_traced
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.geometry import Linear
@@ -185,9 +185,9 @@ class _Equations(NamedTuple):
 
     def solve(self, rhs: Step) -> Step:
         """Return H^-1 b."""
-        vector = reduce_vector(self.system, self.reduced, rhs)
+        vector = reduce_vector(self.system, self.reduced.points, rhs)
         vector = solve_factored(self.system, self.reduced, self.factored, vector)
-        return back_substitute(self.system, self.reduced, rhs, vector)
+        return back_substitute(self.system, self.reduced.points, rhs, vector)
 
 
 def _exact_equations(system: System, unknowns: Unknowns) -> _Equations:
@@ -212,7 +212,7 @@ def _equations(system: System, unknowns: Unknowns, exact: bool) -> _Equations:
     model = assemble(system, unknowns)
     if exact:
         system, model = _hold_saddles(system, model)
-    reduced = eliminate_points(system, model, jax.tree.map(jnp.zeros_like, system.free))
+    reduced = eliminate_points(system, model, one_for_fixed(system, jax.tree.map(jnp.zeros_like, system.free)))
     return _Equations(system, model, reduced, factor_reduced(system, reduced), at_lower, at_upper)
 
 

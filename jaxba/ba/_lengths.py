@@ -46,14 +46,14 @@ def scaled_norm_of(step: Step, diagonal: Step) -> Float[Array, ""]:
     return jnp.sqrt(sum_all(jax.tree.map(lambda s, d: jnp.sum(s**2 * d), step, scale)))
 
 
-def length_in_sigmas(model: Linearisation, step: Step) -> Float[Array, ""]:
-    """Return the length of a step in what each unknown is known to by itself: in sigmas, if all others were fixed."""
+def squared_in_sigmas(model: Linearisation, step: Step) -> Float[Array, ""]:
+    """Return the squared length of a step in what each unknown is known to by itself: in sigmas, all others fixed."""
     blocks = (step.poses, model.diagonal.poses), (step.intrinsics, model.diagonal.intrinsics)
     squares = sum_all([jnp.sum(s**2 * d) for s, d in (*blocks, (step.lever_arm, model.diagonal.lever_arm))])
-    return jnp.sqrt(squares + jnp.einsum("pi,pij,pj->", step.points, model.point_products, step.points))
+    return squares + jnp.einsum("pi,pij,pj->", step.points, model.point_products, step.points)
 
 
-def all_in_sigmas(system: System, unknowns: Unknowns, model: Linearisation) -> Float[Array, ""]:
+def all_squared_in_sigmas(system: System, unknowns: Unknowns, model: Linearisation) -> Float[Array, ""]:
     """Return the same of a step as long as the unknowns: a radian, the way from camera to point, all intrinsics.
 
     `xtol` of it moves what the images see by about `xtol` radian. It depends neither on the origin of the world nor on
@@ -62,4 +62,4 @@ def all_in_sigmas(system: System, unknowns: Unknowns, model: Linearisation) -> F
     ray = unknowns.points - rows_of(unknowns.poses.center, system.point_image)
     of_points = jnp.sum(ray**2, axis=1) * jnp.trace(model.point_products, axis1=1, axis2=2)
     of_intrinsics = jnp.sum(unknowns.intrinsics**2 * model.diagonal.intrinsics)
-    return jnp.sqrt(jnp.sum(of_points) + of_intrinsics + jnp.sum(model.diagonal.poses[:, :3]))
+    return jnp.sum(of_points) + of_intrinsics + jnp.sum(model.diagonal.poses[:, :3])

@@ -41,7 +41,7 @@ from jaxba.ba._linearise import linearise
 from jaxba.ba._plan import Plan
 from jaxba.ba._priors import robust_rows
 from jaxba.ba._rows import rows_of
-from jaxba.ba._schur import Reduced, eliminate_points
+from jaxba.ba._schur import Eliminated, Reduced, apply_root, eliminate_points, one_for_fixed
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Unknowns
 from jaxba.geometry import AbstractLoss, Linear
@@ -79,7 +79,8 @@ def marginals(
 ) -> Marginals:
     """Return the marginals, of a system damped by `damping * diag(J^T J)`; `num_free` counts what may change."""
     model = linearise(system, unknowns)
-    reduced = eliminate_points(system, model, jax.tree.map(lambda d: damping * d, model.diagonal))
+    damped = one_for_fixed(system, jax.tree.map(lambda d: damping * d, model.diagonal))
+    reduced = eliminate_points(system, model, damped)
     inverse, cross, corner = _inverse(system, reduced)
     images = jnp.arange(system.shape.num_images)
     blocks = inverse[images, :, images]
@@ -88,7 +89,7 @@ def marginals(
     return Marginals(
         blocks=blocks,
         border=corner,
-        points=_point_covariances(system, plan, reduced, inverse, cross, corner),
+        points=_point_covariances(system, plan, reduced.points, inverse, cross, corner),
         block_inflation=jnp.diagonal(blocks, axis1=1, axis2=2) * diagonal,
         border_inflation=jnp.diagonal(corner) * jnp.diagonal(reduced.corner),
         variance_factor=variance_factor,
@@ -124,11 +125,14 @@ def _inverse(system: System, reduced: Reduced) -> tuple[Array, Array, Array]:
 
 
 def _point_covariances(
-    system: System, plan: Plan, reduced: Reduced, inverse: Array, cross: Array, corner: Array
+    system: System, plan: Plan, eliminated: Eliminated, inverse: Array, cross: Array, corner: Array
 ) -> Float[Array, "points 3 3"]:
     shape = system.shape
     point, image = jnp.asarray(plan.row_point), jnp.asarray(plan.row_image)
-    z, z_shared = reduced.z, reduced.z_shared
+    z, z_shared = (
+        apply_root(rows_of(eliminated.root, point), eliminated.w),
+        apply_root(eliminated.root, eliminated.shared),
+    )
     num_shared = z_shared.shape[-1]
     cross, corner = cross[:, :, :num_shared], corner[:num_shared, :num_shared]  # no observation sees the lever arm
 
@@ -156,7 +160,7 @@ def _point_covariances(
         mixed = jnp.einsum("nik,njk->nij", through, z_shared)
         total += mixed + jnp.swapaxes(mixed, 1, 2)
         total += jnp.einsum("nik,kl,njl->nij", z_shared, corner, z_shared)
-    root = _lower_triangle(reduced.point_root)
+    root = _lower_triangle(eliminated.root)
     covariances = jnp.einsum("nki,nkl,nlj->nij", root, jnp.eye(3, dtype=z.dtype) + total, root)
     return covariances * system.free.points[:, :1, None]
 

@@ -23,13 +23,13 @@ import equinox as eqx
 import numpy as np
 from jax import Array
 from jax.core import Tracer
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._problem import Problem
+from jaxba.ba._projection import camera_centers
 from jaxba.geometry import require_number
 
 ROW_RUN = 32
@@ -106,7 +106,7 @@ class Plan(eqx.Module):
     row_image: Int[Array | np.ndarray, " rows"]
     row_point: Int[Array | np.ndarray, " rows"]
     point_image: Int[Array | np.ndarray, " padded_points"]
-    """The first image that sees each point; both in solver order, padding included."""
+    """The image that sees each point and comes first in the problem; both in solver order, padding included."""
     pair_first: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
     pair_second: Int[Array | np.ndarray, "chunks pair_chunk pair_run"]
     """Rows of each pair; the first one's image comes later in the order. Padding is the last row, of weight zero."""
@@ -118,13 +118,19 @@ class Plan(eqx.Module):
 
 
 def make_plan(
-    problem: Problem, *, linear_solver: LinearSolver = "auto", like: PlanShape | None = None, spare: float = 0.0
+    problem: Problem,
+    *,
+    linear_solver: LinearSolver = "auto",
+    like: PlanShape | None = None,
+    spare: float = 0.0,
+    image_order: Int[np.ndarray, " images"] | None = None,
 ) -> Plan:
     """Return the plan of a problem, whose indices and `free` masks must be concrete (not traced).
 
     For a series of like problems, whose observations come and go, that shall share compiled code: `spare` leaves room
     for this share of points, observations and pairs more, and `like`, the shape of an earlier plan of the series, gives
-    the least sizes and the linear solver. What outgrows it gets a shape of its own.
+    the least sizes, the intrinsics that are refined and the linear solver. What outgrows it gets a shape of its own.
+    `image_order` is in place of the order that makes the reduced system narrow.
 
     Raises `JaxbaError` for options out of range.
     """
@@ -137,11 +143,14 @@ def make_plan(
     point = np.asarray(problem.observations.point_index)
     free_pose, free_point = np.asarray(problem.free.poses), np.asarray(problem.free.points)
     refined = np.atleast_1d(np.asarray(problem.free.intrinsics).any(axis=0))
-    own_cameras = _own_cameras(problem) and problem.num_cameras > 1 and not _any_bound(problem)
+    several = problem.num_cameras > 1 or (like is not None and like.own_cameras)
+    own_cameras = _own_cameras(problem) and several and not _any_bound(problem)
+    if like is not None and like.own_cameras == own_cameras and len(like.refined) == len(refined):
+        refined = refined | np.array(like.refined)
     block = 6 + (int(refined.sum()) if own_cameras else 0)
 
     coupled = free_point[point] & (free_pose[image] | own_cameras)
-    image_order, bandwidth = _order_images(image[coupled], point[coupled], problem)
+    image_order, bandwidth = _order_images(image[coupled], point[coupled], problem, image_order)
     solver, panel_images, band_panels = _choose_linear_solver(linear_solver, len(image_order), block, bandwidth)
     if like is not None and like.block == block and band_panels <= like.band_panels:
         solver, panel_images, band_panels = like.linear_solver, like.panel_images, like.band_panels
@@ -197,7 +206,7 @@ def make_plan(
         row_observation=row_observation,
         row_image=row_image,
         row_point=row_point,
-        point_image=_first_images(row_image, row_point, row_observation >= 0, num_points),
+        point_image=_point_images(image, point, rank_of_image, point_order, num_points),
         pair_first=runs.first,
         pair_second=runs.second,
         pair_block=runs.block_of_run,
@@ -228,7 +237,10 @@ def _any_bound(problem: Problem) -> bool:
 
 
 def _order_images(
-    image: Int[np.ndarray, " n"], point: Int[np.ndarray, " n"], problem: Problem
+    image: Int[np.ndarray, " n"],
+    point: Int[np.ndarray, " n"],
+    problem: Problem,
+    given: Int[np.ndarray, " images"] | None,
 ) -> tuple[Int[np.ndarray, " images"], int]:
     """Return an order of the images with a small bandwidth of the reduced system, and that bandwidth in images.
 
@@ -239,11 +251,15 @@ def _order_images(
         (np.ones(len(image), np.int32), (image, point)), shape=(problem.num_images, problem.num_points)
     )
     graph = sparse.coo_array(seen @ seen.T)
-    orders = [
-        np.arange(problem.num_images),
-        reverse_cuthill_mckee(sparse.csr_array(graph), symmetric_mode=True),
-        *_sweeps(problem),
-    ]
+    orders = (
+        [given]
+        if given is not None
+        else [
+            np.arange(problem.num_images),
+            reverse_cuthill_mckee(sparse.csr_array(graph), symmetric_mode=True),
+            *_sweeps(problem),
+        ]
+    )
     bandwidths = []
     for order in orders:
         rank = np.argsort(order)
@@ -256,8 +272,7 @@ def _sweeps(problem: Problem) -> list[Int[np.ndarray, " images"]]:
     """Orders of the images along twelve directions in the plane of the block; none where positions are traced."""
     if isinstance(problem.poses.translation, Tracer) or isinstance(problem.poses.quaternion, Tracer):
         return []
-    rotation = Rotation.from_quat(np.array(problem.poses.quaternion, float), scalar_first=True)
-    center = -rotation.apply(np.array(problem.poses.translation, float), inverse=True)
+    center = camera_centers(problem.poses)
     center = np.nan_to_num(center - center.mean(axis=0))
     axes = np.linalg.svd(center, full_matrices=False)[2][:2]
     angles = np.arange(12) * np.pi / 12
@@ -314,17 +329,19 @@ def _layout_rows(
     return row_observation, row_image
 
 
-def _first_images(
-    row_image: Int[np.ndarray, " rows"],
-    row_point: Int[np.ndarray, " rows"],
-    seen: Bool[np.ndarray, " rows"],
+def _point_images(
+    image: Int[np.ndarray, " n"],
+    point: Int[np.ndarray, " n"],
+    rank_of_image: Int[np.ndarray, " images"],
+    point_order: Int[np.ndarray, " points"],
     count: int,
 ) -> Int[np.ndarray, " count"]:
-    """Return the first image that sees each point, 0 where none does."""
-    first = np.zeros(count, np.int32)
-    rows = np.flatnonzero(seen)[::-1]  # images ascend with the rows, and the last one written stays
-    first[row_point[rows]] = row_image[rows]
-    return first
+    """Return, in solver order, the image that comes first in the problem's own order among those that see a point."""
+    first = np.full(len(point_order), len(rank_of_image), np.int32)
+    np.minimum.at(first, point, image.astype(np.int32))
+    found = np.zeros(count, np.int32)
+    found[: len(point_order)] = np.append(rank_of_image, 0)[first[point_order]]
+    return found
 
 
 def _pairs(

@@ -21,6 +21,12 @@ def rotation_matrices(poses: Pose) -> Float[np.ndarray, "images 3 3"]:
     return Rotation.from_quat(np.asarray(poses.quaternion, float), scalar_first=True).as_matrix()
 
 
+def camera_centers(poses: Pose) -> Float[np.ndarray, "images 3"]:
+    """Return where the cameras stand in the world, metres."""
+    rotation = Rotation.from_quat(np.array(poses.quaternion, float), scalar_first=True)
+    return -rotation.apply(np.array(poses.translation, float), inverse=True)
+
+
 def points_in_cam(problem: Problem) -> Float[np.ndarray, "3 observations"]:
     """Return each observed point in the frame of its camera, metres; the last component is the depth."""
     image, point = np.asarray(problem.observations.image_index), np.asarray(problem.observations.point_index)

@@ -12,12 +12,13 @@ the reduced system over images and border, U, B and C the blocks that were there
 
 plus the priors and the damping. Sums over an image are batched products of runs of rows; sums over pairs are products
 of short runs gathered a few at a time, so that they stay in the cache: 188k pairs of 500 images take 10 ms, where one
-product a pair takes 56 ms. Right-hand sides and back-substitution read Z alone.
+product a pair takes 56 ms. Right-hand sides and back-substitution need W and the points' L^-1 alone.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
@@ -29,21 +30,29 @@ from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step
 
 
+class Eliminated(eqx.Module):
+    """Points taken out of the equations.
+
+    - `root`: the lower triangle (xx, yx, yy, zx, zy, zz) of each point's L^-1.
+    - `w`, `shared`: W of each observation, W_k of each point.
+    """
+
+    root: Float[Array, "points 6"]
+    w: Float[Array, "rows 3 block"]
+    shared: Float[Array, "points 3 shared"]
+
+
 class Reduced(eqx.Module):
     """The reduced system [A B; B^T C], block-sparse over images with a dense border, and the eliminated points.
 
     - `diagonal`, `off_diagonal`: blocks of A; off-diagonal ones lie below the diagonal, see `System.block_row`.
-    - `point_root`: the lower triangle (xx, yx, yy, zx, zy, zz) of each point's L^-1.
-    - `z`, `z_shared`: Z of each observation, Z_k of each point.
     """
 
     diagonal: Float[Array, "images block block"]
     off_diagonal: Float[Array, "blocks block block"]
     border: Float[Array, "images block border"]
     corner: Float[Array, "border border"]
-    point_root: Float[Array, "points 6"]
-    z: Float[Array, "rows 3 block"]
-    z_shared: Float[Array, "points 3 shared"]
+    points: Eliminated
 
 
 class ReducedVector(eqx.Module):
@@ -53,13 +62,23 @@ class ReducedVector(eqx.Module):
     border: Float[Array, " border"]
 
 
+def one_for_fixed(system: System, damping: Step) -> Step:
+    """Return the damping with a one for all that is fixed or padding, which has nothing on its diagonal."""
+    return jax.tree.map(lambda d, free: d + (1 - free), damping, system.free)
+
+
+def eliminate(model: Linearisation, damping: Float[Array | np.ndarray, "points 3"]) -> Eliminated:
+    """Return the points taken out of `J^T J + diag(damping)`."""
+    root = _inverse_root(model.point_products + _diagonal_matrix(jnp.asarray(damping)))
+    return Eliminated(root, model.w, model.point_shared)
+
+
 def eliminate_points(system: System, model: Linearisation, damping: Step) -> Reduced:
-    """Return the reduced system of `J^T J + diag(damping)`; unknowns that are fixed get a one on the diagonal."""
+    """Return the reduced system of `J^T J + diag(damping)`; see `one_for_fixed`."""
     shape = system.shape
-    damping = jax.tree.map(lambda d, free: d + (1 - free), damping, system.free)
-    root = _inverse_root(model.point_products + _diagonal_matrix(jnp.asarray(damping.points)))
-    z_shared = _apply_root(root, model.point_shared)
-    z, products = _eliminate_rows(system, model.w, root, z_shared)
+    points = eliminate(model, damping.points)
+    z_shared = apply_root(points.root, model.point_shared)
+    z, products = _eliminate_rows(system, model.w, points.root, z_shared)
     eliminated = sum_runs(system, products)
 
     columns = 6 + shape.num_refined
@@ -82,29 +101,28 @@ def eliminate_points(system: System, model: Linearisation, damping: Step) -> Red
     border = jnp.pad(border, ((0, 0), (0, 0), (0, lever)))
     corner = jnp.pad(corner, ((0, lever), (0, lever))) + _diagonal_matrix(vector.border)
     diagonal, border, corner = _add_priors(system, model.prior_blocks, diagonal, border, corner)
-    return Reduced(diagonal, _sum_pairs(system, z), border, corner, root, z, z_shared)
+    return Reduced(diagonal, _sum_pairs(system, z), border, corner, points)
 
 
-def reduce_vector(system: System, reduced: Reduced, rhs: Step) -> ReducedVector:
+def reduce_vector(system: System, points: Eliminated, rhs: Step) -> ReducedVector:
     """Return the right-hand side of the reduced system, `b - W V^-1 b_points`."""
-    half = _apply_root(reduced.point_root, jnp.asarray(rhs.points)[:, :, None])[:, :, 0]
-    at_rows = rows_of(half, system.reprojection.point_index).reshape(-1, 3 * ROW_RUN)
-    z = reduced.z.reshape(-1, 3 * ROW_RUN, reduced.z.shape[-1])
-    through = jnp.einsum("rka,rk->ra", z, at_rows)
+    solved = _solve_roots(points.root, jnp.asarray(rhs.points))
+    at_rows = rows_of(solved, system.reprojection.point_index).reshape(-1, 3 * ROW_RUN)
+    w = points.w.reshape(-1, 3 * ROW_RUN, points.w.shape[-1])
+    through = jnp.einsum("rka,rk->ra", w, at_rows)
     vector = to_reduced(system, rhs)
-    shared = jnp.einsum("pcg,pc->g", reduced.z_shared, half)
+    shared = jnp.einsum("pcg,pc->g", points.shared, solved)
     shared = jnp.pad(shared, (0, vector.border.shape[0] - shared.shape[0]))
     return ReducedVector(vector.images - sum_runs(system, through), vector.border - shared)
 
 
-def back_substitute(system: System, reduced: Reduced, rhs: Step, solution: ReducedVector) -> Step:
+def back_substitute(system: System, points: Eliminated, rhs: Step, solution: ReducedVector) -> Step:
     """Return the full step whose images and border are `solution`, with `x = V^-1 (b_points - W^T solution)`."""
-    moved = w_product(system, reduced.z, solution.images)
+    moved = w_product(system, points.w, solution.images)
     moved = segments(moved, system.reprojection.point_index, system.shape.num_points)
-    moved += reduced.z_shared @ solution.border[: reduced.z_shared.shape[-1]]
-    half = _apply_root(reduced.point_root, jnp.asarray(rhs.points)[:, :, None])[:, :, 0]
-    points = _apply_root_transposed(reduced.point_root, half - moved)
-    return eqx.tree_at(lambda s: s.points, from_reduced(system, solution, rhs), points)
+    moved += points.shared @ solution.border[: points.shared.shape[-1]]
+    solved = _solve_roots(points.root, rhs.points - moved)
+    return eqx.tree_at(lambda s: s.points, from_reduced(system, solution, rhs), solved)
 
 
 def solve_points(
@@ -117,8 +135,7 @@ def solve_points(
     diagonal = jnp.diagonal(matrix, axis1=1, axis2=2) * damping[:, None]
     seen = jnp.any(diagonal > 0, axis=1, keepdims=True)
     root = _inverse_root(matrix + _diagonal_matrix(jnp.where(seen, diagonal, 1.0)))
-    solution = _apply_root_transposed(root, _apply_root(root, rhs[:, :, None])[:, :, 0])
-    return solution * system.free.points
+    return _solve_roots(root, rhs) * system.free.points
 
 
 def to_reduced(system: System, step: Step) -> ReducedVector:
@@ -160,7 +177,7 @@ def _eliminate_rows(
     def chunk(_: None, fields: tuple[Array, Array]) -> tuple[None, tuple[Array, Array]]:
         w, index = fields
         at_rows = rows_of(of_points, index)
-        z = _apply_root(at_rows[:, :6], w)
+        z = apply_root(at_rows[:, :6], w)
         shared = at_rows[:, 6:].reshape(rows, 3, z_shared.shape[-1])
         left, right = (a.reshape(-1, 3 * ROW_RUN, a.shape[-1]) for a in (z, jnp.concatenate([z, shared], axis=-1)))
         return None, (z, jnp.einsum("rka,rkb->rab", left, right))
@@ -183,16 +200,17 @@ def _inverse_root(matrix: Float[Array, "n 3 3"]) -> Float[Array, "n 6"]:
     return jnp.stack([a, ba, b, -c * (l20 * a + l21 * ba), -c * l21 * b, c], axis=-1)
 
 
-def _apply_root(root: Float[Array, "n 6"], vectors: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
+def apply_root(root: Float[Array, "n 6"], vectors: Float[Array, "n 3 k"]) -> Float[Array, "n 3 k"]:
     """Return L^-1 v, for k vectors each."""
     r = root[:, :, None]
     x, y, z = vectors[:, 0], vectors[:, 1], vectors[:, 2]
     return jnp.stack([r[:, 0] * x, r[:, 1] * x + r[:, 2] * y, r[:, 3] * x + r[:, 4] * y + r[:, 5] * z], axis=1)
 
 
-def _apply_root_transposed(root: Float[Array, "n 6"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Return L^-T v."""
-    r, (u, v, w) = root.T, vectors.T
+def _solve_roots(root: Float[Array, "n 6"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Return L^-T L^-1 v."""
+    r = root.T
+    u, v, w = apply_root(root, vectors[:, :, None])[:, :, 0].T
     return jnp.stack([r[0] * u + r[1] * v + r[3] * w, r[2] * v + r[4] * w, r[5] * w], axis=-1)
 
 

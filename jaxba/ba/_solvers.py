@@ -23,17 +23,17 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxba.ba._factor import solve_reduced
 from jaxba.ba._lengths import (
-    all_in_sigmas,
+    all_squared_in_sigmas,
     damping_scale,
-    length_in_sigmas,
     norm_of,
     scaled_norm_of,
     slope_along,
+    squared_in_sigmas,
     sum_all,
 )
 from jaxba.ba._linearise import Linearisation, cost, curvature, linearise
 from jaxba.ba._refine import move_points, refine_points
-from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, reduce_vector, to_reduced
+from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, one_for_fixed, reduce_vector, to_reduced
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.geometry import require_number
@@ -73,6 +73,28 @@ class Proposal(NamedTuple):
     step: Step
     linear_iterations: Int[Array, ""]
     shortened: Float[Array, ""]
+
+
+class Tried(NamedTuple):
+    """What a step would do, as far as it takes to judge it.
+
+    - `cost`: after it. `promised`: by which the quadratic model says the cost falls.
+    - `gradient_norm`: largest entry of the gradient before it, without what presses an intrinsic against its bound.
+    - `shortened`: how many times as long the step would be with full trust.
+    - `in_sigmas`, `all_in_sigmas`: length of the step and of all unknowns, see `_lengths.py`; `norm`, `scaled_norm`
+      too.
+    """
+
+    cost: Float[Array, ""]
+    promised: Float[Array, ""]
+    gradient_norm: Float[Array, ""]
+    shortened: Float[Array, ""]
+    in_sigmas: Float[Array, ""]
+    all_in_sigmas: Float[Array, ""]
+    norm: Float[Array, ""]
+    scaled_norm: Float[Array, ""]
+    linear_iterations: Int[Array, ""]
+    points_held: Int[Array, ""]
 
 
 def require_tolerance(label: str, value: Any) -> None:
@@ -124,7 +146,10 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
         self, fn: Any, y: Unknowns, args: System, options: Any, f_struct: Any, aux_struct: Any, tags: frozenset[object]
     ) -> State:
         del fn, options, f_struct, aux_struct, tags
-        start = cost(args, y)
+        return self.state_of(cost(args, y))
+
+    def state_of(self, start: Float[Array, ""]) -> State:
+        """Return the state before the first step, from the cost at the start values."""
         zero = jnp.zeros_like(start)
         return State(
             trust=zero + self.initial_trust,
@@ -147,45 +172,59 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
         del fn, options, tags
         system = args
         model = linearise(system, y, state.bend)
-        gradient_norm = _projected_gradient_norm(system, y, model.gradient)
         step, linear_iterations, shortened = self.propose(system, y, model, state.trust)
         step = _within_bounds(system, y, step)
-        promised = -slope_along(model.gradient, step) - curvature(system, model, step) / 2
         moved = eqx.tree_at(lambda u: u.points, y.retract(step), move_points(system, y, step.points))
         trial, points_held = refine_points(system, moved, y, state.bend > 0)
-        trial_cost = cost(system, trial)
-        finite = jnp.isfinite(promised) & jnp.isfinite(trial_cost)
-        change = jnp.where(finite, state.cost - trial_cost, -jnp.inf)
-        ratio = jnp.where(finite & (promised > 0), change / promised, -1.0)
-        at_optimum = gradient_norm <= self.atol
+        tried = Tried(
+            cost=cost(system, trial),
+            promised=-slope_along(model.gradient, step) - curvature(system, model, step) / 2,
+            gradient_norm=projected_gradient_norm(system.lower, system.upper, y.intrinsics, model.gradient),
+            shortened=shortened,
+            in_sigmas=jnp.sqrt(squared_in_sigmas(model, step)),
+            all_in_sigmas=jnp.sqrt(all_squared_in_sigmas(system, y, model)),
+            norm=norm_of(step),
+            scaled_norm=scaled_norm_of(step, model.diagonal),
+            linear_iterations=linear_iterations,
+            points_held=points_held,
+        )
+        # a derivative through the steps takes their lengths, which depend on the values in jumps, as they are
+        new_state = jax.lax.stop_gradient(self.judge(state, tried))
+        new = jax.tree.map(lambda a, b: jnp.where(new_state.accepted, a, b), trial, y)
+        return new, new_state, None
+
+    def judge(self, state: State, tried: Tried) -> State:
+        """Return the state after a step was tried; whether it is kept stands there."""
+        finite = jnp.isfinite(tried.promised) & jnp.isfinite(tried.cost)
+        change = jnp.where(finite, state.cost - tried.cost, -jnp.inf)
+        ratio = jnp.where(finite & (tried.promised > 0), change / tried.promised, -1.0)
+        at_optimum = tried.gradient_norm <= self.atol
         accepted = (ratio > _MIN_RATIO) & ~at_optimum
-        trust, factor = self.adapt(state, ratio, scaled_norm_of(step, model.diagonal))
+        trust, factor = self.adapt(state, ratio, tried.scaled_norm)
 
         # what little trust leaves of a step says nothing about the way to the optimum
-        small = finite & (shortened * promised <= self.rtol * state.cost) & (jnp.abs(change) <= self.rtol * state.cost)
-        turn = shortened * length_in_sigmas(model, step)
-        short = finite & (turn <= self.xtol * (self.xtol + all_in_sigmas(system, y, model)))
+        nothing = self.rtol * state.cost
+        small = finite & (tried.shortened * tried.promised <= nothing) & (jnp.abs(change) <= nothing)
+        turn = tried.shortened * tried.in_sigmas
+        short = finite & (turn <= self.xtol * (self.xtol + tried.all_in_sigmas))
         status = jnp.where(self._exhausted(trust), STUCK, RUNNING)
         status = jnp.where(short, XTOL, status)
         status = jnp.where(small, FTOL, status)
         status = jnp.where(at_optimum, GTOL, status)
-        new = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), trial, y)
-        new_state = State(
+        return State(
             trust=trust,
             bend=jnp.where(accepted, jnp.where(change < _BEND_BELOW * state.cost, _BEND, state.bend), 0.0),
             factor=factor,
-            cost=jnp.where(accepted, trial_cost, state.cost),
+            cost=jnp.where(accepted, tried.cost, state.cost),
             change=jnp.where(accepted, change, 0.0),
-            gradient_norm=gradient_norm,
-            step_norm=norm_of(step),
-            linear_iterations=linear_iterations,
-            points_held=points_held,
+            gradient_norm=tried.gradient_norm,
+            step_norm=tried.norm,
+            linear_iterations=tried.linear_iterations,
+            points_held=tried.points_held,
             accepted=accepted,
             status=status,
             num_steps=state.num_steps + 1,
         )
-        # a derivative through the steps takes their lengths, which depend on the values in jumps, as they are
-        return new, jax.lax.stop_gradient(new_state), None
 
     def terminate(
         self, fn: Any, y: Unknowns, args: System, options: Any, state: State, tags: frozenset[object]
@@ -290,17 +329,24 @@ def _damped_step(system: System, unknowns: Unknowns, model: Linearisation, dampi
     ones in which a point is known, and along the ray of a far point the diagonal would outweigh what its images tell.
     """
     scaled = jax.tree.map(lambda d: damping * d, damping_scale(model.diagonal))
-    unseen = jnp.where(model.diagonal.points > 0, 0.0, 1.0)
-    scaled = eqx.tree_at(lambda s: s.points, scaled, unseen)
-    damped = eqx.tree_at(lambda m: m.point_products, model, (1 + damping) * model.point_products)
+    damped, of_points = damped_points(model, damping)
+    scaled = one_for_fixed(system, eqx.tree_at(lambda s: s.points, scaled, of_points))
     reduced = eliminate_points(system, damped, scaled)
     rhs = jax.tree.map(lambda g: -g, model.gradient)
-    lower, upper = _step_bounds(system, unknowns)
-    solved = solve_reduced(system, reduced, reduce_vector(system, reduced, rhs), lower, upper)
-    return Proposal(back_substitute(system, reduced, rhs, solved.vector), solved.iterations, 1 + damping)
+    lower, upper = step_bounds(system, unknowns)
+    solved = solve_reduced(system, reduced, reduce_vector(system, reduced.points, rhs), lower, upper)
+    return Proposal(back_substitute(system, reduced.points, rhs, solved.vector), solved.iterations, 1 + damping)
 
 
-def _step_bounds(system: System, unknowns: Unknowns) -> tuple[Array | None, Array | None]:
+def damped_points(
+    model: Linearisation, damping: Float[Array, ""]
+) -> tuple[Linearisation, Float[Array | np.ndarray, "points 3"]]:
+    """Return the equations with the points' blocks damped, and a one on the diagonal of each that nothing sees."""
+    damped = eqx.tree_at(lambda m: m.point_products, model, (1 + damping) * model.point_products)
+    return damped, jnp.where(model.diagonal.points > 0, 0.0, 1.0)
+
+
+def step_bounds(system: System, unknowns: Unknowns) -> tuple[Array | None, Array | None]:
     """Bounds of the border's step; None where nothing is bounded."""
     if not system.shape.any_bound:
         return None, None
@@ -327,11 +373,14 @@ def _within_bounds(system: System, unknowns: Unknowns, step: Step) -> Step:
     return eqx.tree_at(lambda s: s.intrinsics, step, intrinsics)
 
 
-def _projected_gradient_norm(system: System, unknowns: Unknowns, gradient: Step) -> Float[Array, ""]:
+def projected_gradient_norm(
+    lower: Float[Array | np.ndarray, "cameras parameters"],
+    upper: Float[Array | np.ndarray, "cameras parameters"],
+    intrinsics: Float[Array | np.ndarray, "cameras parameters"],
+    gradient: Step,
+) -> Float[Array, ""]:
     """Largest entry of the gradient, without what presses an intrinsic against its bound."""
-    intrinsics = gradient.intrinsics
-    if system.shape.any_bound:
-        at_lower, at_upper = unknowns.intrinsics <= system.lower, unknowns.intrinsics >= system.upper
-        intrinsics = jnp.where((at_lower & (intrinsics > 0)) | (at_upper & (intrinsics < 0)), 0.0, intrinsics)
-    projected = eqx.tree_at(lambda g: g.intrinsics, gradient, intrinsics)
+    of_intrinsics = gradient.intrinsics
+    pressed = ((intrinsics <= lower) & (of_intrinsics > 0)) | ((intrinsics >= upper) & (of_intrinsics < 0))
+    projected = eqx.tree_at(lambda g: g.intrinsics, gradient, jnp.where(pressed, 0.0, of_intrinsics))
     return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0.0) for leaf in jax.tree.leaves(projected)]))

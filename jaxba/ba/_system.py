@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, PlanShape, bucket, make_plan
 from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba._projection import camera_centers
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.ba.checks import Prepared, prepare
 from jaxba.ba.groups import Reprojection
@@ -68,7 +69,7 @@ def centred(problem: Problem) -> tuple[Problem, Float[np.ndarray, "3"]]:
     holds a position of 4.6e6 m to 1e-9 m, and the noise of that in the cost hides the last steps to the optimum.
     """
     rotation = Rotation.from_quat(np.array(problem.poses.quaternion, float), scalar_first=True)
-    centers = -rotation.apply(np.array(problem.poses.translation, float), inverse=True)
+    centers = camera_centers(problem.poses)
     origin = np.round(np.median(centers, axis=0))
     if np.abs(origin).max() <= np.ptp(centers, axis=0).max() or any(p.in_world is None for p in problem.priors):
         return problem, np.zeros(3)

@@ -20,7 +20,7 @@ from jaxba.ba._factor import factor_reduced, solve_factored
 from jaxba.ba._hessian import hessian
 from jaxba.ba._linearise import cost, curvature
 from jaxba.ba._plan import make_plan
-from jaxba.ba._schur import back_substitute, eliminate_points, reduce_vector
+from jaxba.ba._schur import back_substitute, eliminate_points, one_for_fixed, reduce_vector
 from jaxba.ba._system import System, initial_unknowns, make_system
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.geometry import Cauchy
@@ -167,9 +167,15 @@ def test_a_point_on_a_saddle_is_held_and_told():
         model = hessian(free, unknowns)
         bent = eqx.tree_at(lambda m: m.point_products, model, model.point_products.at[point, 2, 2].multiply(-1.0))
         system, held = _hold_saddles(free, bent)
-        reduced = eliminate_points(system, held, jax.tree.map(jnp.zeros_like, rhs))
-        vector = solve_factored(system, reduced, factor_reduced(system, reduced), reduce_vector(system, reduced, rhs))
-        return back_substitute(system, reduced, rhs, vector), _equations(fixed, unknowns, True).solve(rhs), system.free
+        reduced = eliminate_points(system, held, one_for_fixed(system, jax.tree.map(jnp.zeros_like, rhs)))
+        vector = solve_factored(
+            system, reduced, factor_reduced(system, reduced), reduce_vector(system, reduced.points, rhs)
+        )
+        return (
+            back_substitute(system, reduced.points, rhs, vector),
+            _equations(fixed, unknowns, True).solve(rhs),
+            system.free,
+        )
 
     found, expected, left = jax.device_get(solutions(free, fixed, unknowns))
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):

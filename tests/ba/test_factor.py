@@ -13,7 +13,7 @@ from small_problems import EVERY_CAMERA, small_problem
 from jaxba.ba import Unknowns
 from jaxba.ba._factor import box_minimum, factor_solve, factorise
 from jaxba.ba._linearise import linearise
-from jaxba.ba._schur import Reduced, eliminate_points
+from jaxba.ba._schur import Reduced, eliminate_points, one_for_fixed
 from jaxba.ba._system import System
 
 
@@ -28,7 +28,7 @@ def test_many_right_hand_sides_equal_numpy(linear_solver):
     def solved(system: System, start: Unknowns, rhs: Array) -> tuple[Reduced, Array, Array]:
         model = linearise(system, start)
         damping = jax.tree.map(lambda d: jnp.where(d > 0, 1e-4 * d, 1.0), model.diagonal)
-        reduced = eliminate_points(system, model, damping)
+        reduced = eliminate_points(system, model, one_for_fixed(system, damping))
         return reduced, *factor_solve(system, reduced, factorise(system, reduced), rhs)
 
     reduced, solution, iterations = jax.device_get(solved(system, start, rhs))

@@ -14,7 +14,7 @@ from small_problems import EVERY_CAMERA, RADIAL, small_problem
 from jaxba.ba import Problem, Step, Unknowns
 from jaxba.ba._factor import solve_reduced
 from jaxba.ba._linearise import linearise
-from jaxba.ba._schur import back_substitute, eliminate_points, reduce_vector
+from jaxba.ba._schur import back_substitute, eliminate_points, one_for_fixed, reduce_vector
 from jaxba.ba._system import System
 from jaxba.geometry import SimpleRadial
 
@@ -54,10 +54,10 @@ CASES: dict[str, tuple[Callable[[], Problem], str]] = {
 def damped_step(system: System, start: Unknowns, relative: Step) -> tuple[Step, Step]:
     model = linearise(system, start)
     damping = jax.tree.map(lambda d, r: jnp.where(d > 0, r * d, 1.0), model.diagonal, relative)
-    reduced = eliminate_points(system, model, damping)
+    reduced = eliminate_points(system, model, one_for_fixed(system, damping))
     rhs = jax.tree.map(jnp.negative, model.gradient)
-    solved = solve_reduced(system, reduced, reduce_vector(system, reduced, rhs))
-    return back_substitute(system, reduced, rhs, solved.vector), damping
+    solved = solve_reduced(system, reduced, reduce_vector(system, reduced.points, rhs))
+    return back_substitute(system, reduced.points, rhs, solved.vector), damping
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -46,9 +46,14 @@ def call_compiled(function: Callable[..., Any], *arguments: Any) -> Any:
     >>> call_compiled(jax.numpy.negative, np.ones(2)).tolist()
     [-1.0, -1.0]
     """
+    return compile_ahead(function, *arguments)(*arguments)
+
+
+def compile_ahead(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """Return what `call_compiled` calls for arguments of these shapes."""
     leaves, structure = jax.tree.flatten(arguments)
     shapes = tuple((np.shape(leaf), jax.numpy.result_type(leaf).name) for leaf in leaves)
-    return _ahead(function, structure, shapes)(*arguments)
+    return _ahead(function, structure, shapes)
 
 
 @functools.lru_cache(maxsize=64)

@@ -54,20 +54,36 @@ def descend(
     plain: System = jax.device_put(without_losses(system))
     run = compiled(solver, start, system, plain)
     compiled_at = time.perf_counter()
-    unknowns, state = start, run.init(start, system)
+
+    def step(unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
+        return run.step(unknowns, state, system)
+
+    walked = walk(start, run.init(start, system), step, max_nfev, callback)
+    seconds = compiled_at - begun, time.perf_counter() - compiled_at
+    return Reached(*walked, functools.partial(run.cost, plain), *seconds)
+
+
+def walk(
+    unknowns: Unknowns,
+    state: State,
+    step: Callable[[Unknowns, State], tuple[Unknowns, State]],
+    max_nfev: int,
+    callback: Callable[[HistoryStep], None] | None = None,
+) -> tuple[Unknowns, State, list[HistoryStep], bool]:
+    """Step as `descend` does; return where it stopped, what it tried, and whether Ctrl-C ended it."""
+    begun = time.perf_counter()
     history = [HistoryStep(step=0, seconds=0.0, cost=float(state.cost), accepted=True, trust=float(state.trust))]
     interrupted = False
     try:
         while int(state.status) == RUNNING and len(history) <= max_nfev:
-            reached = run.step(unknowns, state, system)
-            entry = _history_step(len(history), compiled_at, jax.device_get(reached[1]))
+            reached = step(unknowns, state)
+            entry = _history_step(len(history), begun, jax.device_get(reached[1]))
             (unknowns, state), _ = reached, history.append(entry)
             if callback is not None:
                 callback(history[-1])
     except KeyboardInterrupt:
         interrupted = True
-    seconds = compiled_at - begun, time.perf_counter() - compiled_at
-    return Reached(unknowns, state, history, interrupted, functools.partial(run.cost, plain), *seconds)
+    return unknowns, state, history, interrupted
 
 
 class Compiled(NamedTuple):

@@ -12,7 +12,7 @@ from jaxba.ba._rows import rows_of
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
 
-_MIN_DIAGONAL = 1e-12  # of the largest entry of its kind
+MIN_DIAGONAL = 1e-12  # of the largest entry of its kind
 
 
 def sum_all(tree: PyTree) -> Float[Array, ""]:
@@ -25,7 +25,7 @@ def damping_scale(diagonal: Step) -> Step:
 
     def scale(d: Array) -> Array:
         largest = jnp.max(d, initial=0.0)
-        return jnp.maximum(d, jnp.where(largest > 0, _MIN_DIAGONAL * largest, 1.0))
+        return jnp.maximum(d, jnp.where(largest > 0, MIN_DIAGONAL * largest, 1.0))
 
     return jax.tree.map(scale, diagonal)
 

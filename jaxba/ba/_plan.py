@@ -142,19 +142,14 @@ def make_plan(
     image = np.asarray(problem.observations.image_index)
     point = np.asarray(problem.observations.point_index)
     free_pose, free_point = np.asarray(problem.free.poses), np.asarray(problem.free.points)
-    refined = np.atleast_1d(np.asarray(problem.free.intrinsics).any(axis=0))
-    several = problem.num_cameras > 1 or (like is not None and like.own_cameras)
-    own_cameras = _own_cameras(problem) and several and not _any_bound(problem)
-    if like is not None and like.own_cameras == own_cameras and len(like.refined) == len(refined):
-        refined = refined | np.array(like.refined)
-    block = 6 + (int(refined.sum()) if own_cameras else 0)
+    least = bare_shape(problem, like)
+    own_cameras, block = least.own_cameras, least.block
 
     coupled = free_point[point] & (free_pose[image] | own_cameras)
     image_order, bandwidth = _order_images(image[coupled], point[coupled], problem, image_order)
     solver, panel_images, band_panels = _choose_linear_solver(linear_solver, len(image_order), block, bandwidth)
     if like is not None and like.block == block and band_panels <= like.band_panels:
         solver, panel_images, band_panels = like.linear_solver, like.panel_images, like.band_panels
-    least = _NOTHING if like is None else like
     num_images = max(bucket(problem.num_images + 1, multiple=panel_images), least.num_images)
     num_images = -(-num_images // panel_images) * panel_images
 
@@ -181,18 +176,13 @@ def make_plan(
     blocks = np.full(num_blocks, num_images * num_images - 1, np.int64)
     blocks[: len(runs.blocks)] = runs.blocks
 
-    shape = PlanShape(
+    shape = dataclasses.replace(
+        least,
         num_images=num_images,
         num_points=num_points,
         num_rows=num_rows,
         chunk_runs=min(CHUNK_RUNS, num_rows // ROW_RUN),
         num_cameras=num_images if own_cameras else problem.num_cameras,
-        refined=tuple(bool(r) for r in refined),
-        own_cameras=own_cameras,
-        lever_arm=bool(problem.free.lever_arm),
-        any_fixed_pose=not free_pose.all() or least.any_fixed_pose,
-        any_fixed_point=not free_point.all() or least.any_fixed_point,
-        any_bound=_any_bound(problem),
         num_pair_runs=len(runs.block_of_run),
         num_blocks=num_blocks,
         linear_solver=solver,
@@ -213,6 +203,27 @@ def make_plan(
         block_row=(blocks // num_images).astype(np.int32),
         block_column=(blocks % num_images).astype(np.int32),
         shape=shape,
+    )
+
+
+def bare_shape(problem: Problem, like: PlanShape | None = None) -> PlanShape:
+    """Return the shape that says what is free and nothing of sizes, or those of `like`."""
+    least = _NOTHING if like is None else like
+    free = problem.free
+    refined = np.atleast_1d(np.asarray(free.intrinsics).any(axis=0))
+    several = problem.num_cameras > 1 or least.own_cameras
+    own_cameras = _own_cameras(problem) and several and not _any_bound(problem)
+    if least.own_cameras == own_cameras and len(least.refined) == len(refined):
+        refined = refined | np.array(least.refined)
+    return dataclasses.replace(
+        least,
+        num_cameras=problem.num_cameras,
+        refined=tuple(bool(r) for r in refined),
+        own_cameras=own_cameras,
+        lever_arm=bool(free.lever_arm),
+        any_fixed_pose=not np.asarray(free.poses).all() or least.any_fixed_pose,
+        any_fixed_point=not np.asarray(free.points).all() or least.any_fixed_point,
+        any_bound=_any_bound(problem),
     )
 
 

@@ -146,5 +146,5 @@ def _solve_on_host(
     costs = reached.history[0].cost, reached.state.cost, plain(start), plain(reached.unknowns)
     on_host = jax.tree.map(np.asarray, (reached.unknowns, costs, reached.state.status, reached.state.num_steps))
     unknowns, costs, status, num_steps = on_host
-    values = from_centred(restore(unknowns, problem, plan), origin)
+    values = from_centred(restore(unknowns, plan), origin)
     return Solution.of(problem, values, costs, status, num_steps, report)

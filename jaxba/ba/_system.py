@@ -128,25 +128,31 @@ def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = n
 def initial_unknowns(problem: Problem, plan: Plan, dtype: Any = np.float64) -> Unknowns:
     """Return the problem's start values in the solver's order."""
     xp = _namespace((problem, plan))
+    names = type(problem.cameras).parameter_names()
+    parameters = xp.stack([xp.asarray(getattr(problem.cameras, name), dtype) for name in names], axis=-1)
+    return arrange(Unknowns(problem.poses, parameters, problem.lever_arm, problem.points), plan, dtype)
+
+
+def arrange(unknowns: Unknowns, plan: Plan, dtype: Any = np.float64) -> Unknowns:
+    """Return unknowns in the problem's order in the solver's, with padding."""
+    xp = _namespace((unknowns, plan))
     shape = plan.shape
-    quaternion = _padded(xp, problem.poses.quaternion, plan.image_order, shape.num_images, 0.0, dtype)
+    quaternion = _padded(xp, unknowns.poses.quaternion, plan.image_order, shape.num_images, 0.0, dtype)
     quaternion = xp.concatenate(
         [quaternion[: len(plan.image_order)], _identity(shape.num_images - len(plan.image_order))]
     )
-    names = type(problem.cameras).parameter_names()
-    parameters = xp.stack([xp.asarray(getattr(problem.cameras, name), dtype) for name in names], axis=-1)
     return Unknowns(
         poses=Pose(
             xp.asarray(quaternion, dtype),
-            _padded(xp, problem.poses.translation, plan.image_order, shape.num_images, 0.0, dtype),
+            _padded(xp, unknowns.poses.translation, plan.image_order, shape.num_images, 0.0, dtype),
         ),
-        intrinsics=_padded(xp, parameters, plan.camera_order, shape.num_cameras, None, dtype),
-        lever_arm=xp.asarray(problem.lever_arm, dtype),
-        points=_padded(xp, problem.points, plan.point_order, shape.num_points, 1.0, dtype),
+        intrinsics=_padded(xp, unknowns.intrinsics, plan.camera_order, shape.num_cameras, None, dtype),
+        lever_arm=xp.asarray(unknowns.lever_arm, dtype),
+        points=_padded(xp, unknowns.points, plan.point_order, shape.num_points, 1.0, dtype),
     )
 
 
-def restore(unknowns: Unknowns, problem: Problem, plan: Plan) -> Unknowns:
+def restore(unknowns: Unknowns, plan: Plan) -> Unknowns:
     """Return the unknowns in the problem's own order, without padding."""
     xp = _namespace((unknowns, plan))
     image_rank, point_rank = xp.argsort(plan.image_order), xp.argsort(plan.point_order)

@@ -122,7 +122,7 @@ def _result(
     """Return the unknowns in the problem's order, and the cost before and after, with and without losses."""
     before_and_after = jax.tree.map(lambda *both: jnp.stack(both), start, found)
     of_both = jax.vmap(functools.partial(costs, system))(before_and_after)
-    return restore(found, problem, plan), tuple(of_both[plain][end] for plain in (0, 1) for end in (0, 1))
+    return restore(found, plan), tuple(of_both[plain][end] for plain in (0, 1) for end in (0, 1))
 
 
 @eqx.filter_jit

@@ -74,7 +74,7 @@ def minimise(
         unknowns, state = jax.device_get(step(unknowns, state, system))
         if int(state.status) != RUNNING:
             break
-    return Minimum(restore(unknowns, problem, plan), state, plan)
+    return Minimum(restore(unknowns, plan), state, plan)
 
 
 @functools.cache

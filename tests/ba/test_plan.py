@@ -102,7 +102,7 @@ def test_unknowns_come_back_as_they_went_in(name, linear_solver):
     unknowns = initial_unknowns(problem, plan)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(unknowns))
     np.testing.assert_allclose(np.linalg.norm(unknowns.poses.quaternion, axis=1), 1.0, rtol=1e-12)
-    jax.tree.map(np.testing.assert_array_equal, restore(unknowns, problem, plan), start_of(problem))
+    jax.tree.map(np.testing.assert_array_equal, restore(unknowns, plan), start_of(problem))
 
 
 def test_bucket_adds_at_most_an_eighth_and_has_eight_sizes_an_octave():

@@ -1,0 +1,163 @@
+"""Cut a problem into the tiles of a tree: each holds some points with all their observations and the images of these.
+
+Every row of every prior goes to one tile: those of a point to its own, those of an image to the first one that sees it,
+the others to the first tile. Tiles of like sizes get like shapes, so that they share what is compiled.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxba.ba._plan import Plan, bare_shape, make_plan
+from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
+from jaxba.ba._system import System, arrange, make_system, restore
+from jaxba.ba._unknowns import Unknowns
+from jaxba.ba.tiles._dissect import Tree
+from jaxba.geometry import AbstractLoss, Pose
+
+_LIKE = 0.7  # of the observations of the tile that gave a shape: smaller ones get one of their own
+_ROOM = 0.12  # that a shape leaves for tiles with more points or pairs than the one that gave it
+
+
+@dataclasses.dataclass(frozen=True)
+class Tile:
+    """A tile: which of the problem's images, cameras and points it holds, and its structure.
+
+    - `images`, `cameras`, `points`: in the problem's order. `order`: the images in that of elimination, its solver's.
+    """
+
+    images: Int[np.ndarray, " images"]
+    cameras: Int[np.ndarray, " cameras"]
+    points: Int[np.ndarray, " points"]
+    order: Int[np.ndarray, " images"]
+    plan: Plan
+
+    @property
+    def solver_cameras(self) -> Int[np.ndarray, " cameras"]:
+        """Its cameras in the order of its solver."""
+        return self.cameras[self.plan.camera_order]
+
+    def take(self, unknowns: Unknowns) -> Unknowns:
+        """Return the tile's part of all unknowns, in its solver's order."""
+        poses = Pose(unknowns.poses.quaternion[self.images], unknowns.poses.translation[self.images])
+        of_tile = Unknowns(poses, unknowns.intrinsics[self.cameras], unknowns.lever_arm, unknowns.points[self.points])
+        return arrange(of_tile, self.plan)
+
+    def put(self, part: Unknowns, unknowns: Unknowns) -> None:
+        """Write poses and points of the tile's solver into all unknowns, which are numpy arrays."""
+        found = restore(part, self.plan)
+        unknowns.poses.quaternion[self.images] = found.poses.quaternion
+        unknowns.poses.translation[self.images] = found.poses.translation
+        unknowns.points[self.points] = found.points
+
+
+def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int, Tile, System]]:
+    """Return the tiles with their systems, the largest one first, each with its number."""
+    shape = bare_shape(problem)
+    seen = problem.observations
+    tile_of_row = tree.tile_of_point[np.asarray(seen.point_index)]
+    rows_of_tile = np.split(np.argsort(tile_of_row, kind="stable"), np.cumsum(np.bincount(tile_of_row))[:-1])
+    owner = np.zeros(problem.num_images, np.int32)
+    for number in reversed(range(len(rows_of_tile))):
+        owner[np.asarray(seen.image_index)[rows_of_tile[number]]] = number
+    unseen = np.bincount(np.asarray(seen.image_index), minlength=problem.num_images) == 0
+    tile_of_prior = [_tile_of_rows(prior, owner, tree.tile_of_point) for prior in problem.priors]
+    most_rows = [int(np.bincount(tiles, minlength=1).max(initial=1)) for tiles in tile_of_prior]
+    like, given_by = shape, 0
+    for number in sorted(range(len(rows_of_tile)), key=lambda k: -len(rows_of_tile[k])):
+        rows = rows_of_tile[number]
+        images = np.unique(np.append(np.asarray(seen.image_index)[rows], np.flatnonzero(unseen & (number == 0))))
+        points = np.flatnonzero(tree.tile_of_point == number)
+        chosen = [np.flatnonzero(tiles == number) for tiles in tile_of_prior]
+        part, cameras = _part(problem, rows, images, points, chosen, most_rows, own_cameras=shape.own_cameras)
+        order = np.argsort(tree.rank[images]).astype(np.int32)
+        fresh = len(rows) < _LIKE * given_by or not given_by
+        plan = make_plan(
+            part, linear_solver="dense", like=shape if fresh else like, spare=_ROOM if fresh else 0.0, image_order=order
+        )
+        if fresh:
+            like, given_by = plan.shape, len(rows)
+        yield number, Tile(images, cameras, points, images[order], plan), make_system(part, plan, loss)
+
+
+def _tile_of_rows(
+    prior: AbstractPrior, owner: Int[np.ndarray, " images"], tile_of_point: Int[np.ndarray, " points"]
+) -> Int[np.ndarray, " rows"]:
+    for name, tiles in (("image_index", owner), ("point_index", tile_of_point)):
+        if hasattr(prior, name):
+            return tiles[np.asarray(getattr(prior, name))]
+    return np.zeros(_num_rows(prior), np.int32)
+
+
+def _num_rows(prior: AbstractPrior) -> int:
+    return next(np.shape(leaf)[0] for name, leaf in vars(prior).items() if name != "loss")
+
+
+def _part(
+    problem: Problem,
+    rows: Int[np.ndarray, " rows"],
+    images: Int[np.ndarray, " images"],
+    points: Int[np.ndarray, " points"],
+    chosen: list[Int[np.ndarray, " rows"]],
+    most_rows: list[int],
+    *,
+    own_cameras: bool,
+) -> tuple[Problem, Int[np.ndarray, " cameras"]]:
+    """Return the problem of a tile, and its cameras: its images' where each has its own, else all."""
+    seen, free = problem.observations, problem.free
+    camera_index = np.asarray(problem.camera_index)
+    cameras = np.sort(camera_index[images]) if own_cameras else np.arange(problem.num_cameras)
+
+    def place(kept: Int[np.ndarray, " kept"], count: int) -> Int[np.ndarray, " count"]:
+        places = np.zeros(count, np.int32)
+        places[kept] = np.arange(len(kept), dtype=np.int32)
+        return places
+
+    places = {
+        "image_index": place(images, problem.num_images),
+        "point_index": place(points, problem.num_points),
+        "camera_index": place(cameras, problem.num_cameras),
+    }
+
+    def taken(prior: AbstractPrior, rows: Int[np.ndarray, " rows"], most: int) -> AbstractPrior:
+        """Its rows, filled up with ones of infinite sigma."""
+        fields: dict[str, Any] = {}
+        for name, value in vars(prior).items():
+            if name == "loss" or not np.shape(value)[0]:
+                continue
+            given = np.asarray(value)
+            filled = np.broadcast_to(given[:1], (most, *given.shape[1:])).copy()
+            if name.startswith("std"):
+                filled[:] = np.inf
+            filled[: len(rows)] = given[rows]
+            fields[name] = places[name][filled] if name in places else filled
+        return dataclasses.replace(prior, **fields)
+
+    of_observations = Observations(
+        np.asarray(seen.xy_px)[rows],
+        np.asarray(seen.std_px)[rows],
+        places["image_index"][np.asarray(seen.image_index)[rows]],
+        places["point_index"][np.asarray(seen.point_index)[rows]],
+    )
+    part = Problem(
+        poses=Pose(np.asarray(problem.poses.quaternion)[images], np.asarray(problem.poses.translation)[images]),
+        cameras=jax.tree.map(lambda of_cameras: np.asarray(of_cameras)[cameras], problem.cameras),
+        camera_index=places["camera_index"][camera_index[images]],
+        points=np.asarray(problem.points)[points],
+        observations=of_observations,
+        priors=tuple(taken(*each) for each in zip(problem.priors, chosen, most_rows, strict=True)),
+        lever_arm=np.asarray(problem.lever_arm),
+        free=Free(
+            np.asarray(free.poses)[images],
+            np.asarray(free.points)[points],
+            np.asarray(free.intrinsics)[cameras],
+            free.lever_arm,
+        ),
+        lower=np.asarray(problem.lower)[cameras],
+        upper=np.asarray(problem.upper)[cameras],
+    )
+    return part, cameras

@@ -1,0 +1,195 @@
+"""Dissect: a binary tree over the points of a block, by which its images come off in small dense fronts.
+
+Nested dissection (George 1973) by who sees what. A node is a set of points, and each cut parts it in two by a plane. An
+image belongs to the lowest node that holds all points which it sees; so the images of a point all stand on one way from
+its leaf to the root, and eliminating images from the leaves up couples nothing across a cut:
+
+- `eliminated` at a node are its own images,
+- its `boundary` are the images further up that see some point of it.
+
+A point stands where the cameras that see it are on the average: one with a wild start value, or far away, falls on the
+same side as its neighbours. Of four directions and eleven places near the middle, that cut is taken which the fewest
+images see across. Cuts go on while they save arithmetic.
+
+Cost: O(observations) a level and direction.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxba.ba._problem import Problem
+from jaxba.ba._projection import camera_centers
+
+_DIRECTIONS = 4
+_CUTS = np.linspace(-0.1, 0.1, 11)  # from the middle, in shares of the points
+_SAMPLE = 20_000  # observations that tell where the middle is
+_PER_FRONT, _PER_ENTRY = 2e6, 100.0  # flops in the time that it takes to begin a front, and to move one of its entries
+
+
+@dataclasses.dataclass(frozen=True)
+class Node:
+    """A node of the tree: images in the order in which they are eliminated, and the numbers of its children."""
+
+    eliminated: Int[np.ndarray, " eliminated"]
+    boundary: Int[np.ndarray, " boundary"]
+    children: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tree:
+    """The nodes, children before their parent and the root last.
+
+    - `tiles`: the nodes that are tiles; what lies below one belongs to it.
+    - `tile_of_point`: which tile, counted from 0, holds each point with all its observations.
+    - `node_of_image`, `rank`: where each image is eliminated, and its place in the order of elimination.
+    """
+
+    nodes: tuple[Node, ...]
+    tiles: tuple[int, ...]
+    tile_of_point: Int[np.ndarray, " points"]
+    node_of_image: Int[np.ndarray, " images"]
+    rank: Int[np.ndarray, " images"]
+
+
+def dissect(problem: Problem, *, block: int, border: int, max_observations: float, num_tiles: int = 1) -> Tree:
+    """Return the tree of a problem.
+
+    - `block`, `border`: unknowns of an image, and those that all share.
+    - `max_observations`: of a tile, unless a single point has more. `num_tiles`: at least so many, where points allow.
+    """
+    return _Dissection(problem, block, border, max_observations).tree(num_tiles)
+
+
+def front_flops(eliminated: float, rest: float) -> float:
+    """Return the flops of one front, Cholesky and the update of what is handed on, from its numbers of unknowns."""
+    return eliminated**3 / 3 + eliminated**2 * rest + eliminated * rest**2
+
+
+class _Dissection:
+    """The state of the recursion: nodes so far, and where images and points went."""
+
+    def __init__(self, problem: Problem, block: int, border: int, max_observations: float) -> None:
+        seen = problem.observations
+        self.image, self.point = np.asarray(seen.image_index), np.asarray(seen.point_index)
+        self.block, self.border, self.most = block, border, max_observations
+        self.count = np.bincount(self.image, minlength=problem.num_images)
+        self.centers = camera_centers(problem.poses)
+        of_point = np.maximum(np.bincount(self.point, minlength=problem.num_points), 1)
+        self.places = np.stack(
+            [np.bincount(self.point, of[self.image], problem.num_points) / of_point for of in self.centers.T], axis=1
+        )
+        self.nodes: list[Node] = []
+        self.tiles: list[int] = []
+        self.tile_of_point = np.zeros(problem.num_points, np.int32)
+
+    def tree(self, num_tiles: int) -> Tree:
+        rows = np.argsort(self.image, kind="stable").astype(np.int32)
+        self._node(rows, max(num_tiles, int(np.ceil(len(rows) / self.most))))
+        nothing = np.flatnonzero(self.count == 0)
+        root = self.nodes[-1]
+        self.nodes[-1] = dataclasses.replace(root, eliminated=np.concatenate([root.eliminated, nothing]))
+        order = np.concatenate([node.eliminated for node in self.nodes])
+        rank = np.empty(len(order), np.int32)
+        rank[order] = np.arange(len(order), dtype=np.int32)
+        node_of_image = np.empty(len(order), np.int32)
+        node_of_image[order] = np.repeat(np.arange(len(self.nodes)), [len(node.eliminated) for node in self.nodes])
+        nodes = [dataclasses.replace(n, boundary=n.boundary[np.argsort(rank[n.boundary])]) for n in self.nodes]
+        return Tree(tuple(nodes), tuple(self.tiles), self.tile_of_point, node_of_image, rank)
+
+    def _node(self, rows: Int[np.ndarray, " rows"], num_tiles: int) -> None:
+        """Add the node of these observations, sorted by image, and all below it.
+
+        `num_tiles`: to be made of them; 0 inside a tile.
+        """
+        seen = self._seen(rows)
+        if num_tiles == 1 and len(rows) > self.most:
+            num_tiles = 2
+        cut = self._cut(seen, (num_tiles // 2) / num_tiles) if num_tiles > 1 else None
+        is_tile = num_tiles == 1 or (num_tiles > 1 and cut is None)
+        if cut is None:
+            num_tiles = 0
+            cut = self._saving_cut(seen)
+        children, eliminated = (), seen.images[seen.whole]
+        if cut is not None:
+            below = []
+            for side, tiles in ((cut.left, num_tiles // 2), (~cut.left, num_tiles - num_tiles // 2)):
+                self._node(rows[side], tiles)
+                below.append(len(self.nodes) - 1)
+            children, eliminated = tuple(below), seen.images[seen.whole & cut.across]
+        if is_tile:
+            self.tile_of_point[self.point[rows]] = len(self.tiles)
+            self.tiles.append(len(self.nodes))
+        self.nodes.append(Node(self._along(eliminated), seen.images[~seen.whole], children))
+
+    def _seen(self, rows: Int[np.ndarray, " rows"]) -> "_Seen":
+        of_rows = self.image[rows]
+        starts = np.flatnonzero(np.diff(of_rows, prepend=-1))
+        images = of_rows[starts]
+        return _Seen(rows, starts, images, np.diff(starts, append=len(rows)) == self.count[images])
+
+    def _cut(self, seen: "_Seen", share: float) -> "_Cut | None":
+        """Return the best cut that leaves about this share of the observations on the left; None where all are one."""
+        centers = self.centers[seen.images] - self.centers[seen.images].mean(axis=0)
+        axes = np.linalg.svd(centers.T @ centers)[0][:, :2]
+        angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+        by_place = self.places[self.point[seen.rows]] @ axes @ np.stack([np.cos(angles), np.sin(angles)])
+        for along in (by_place, self.point[seen.rows].astype(float)[:, None]):
+            low = np.minimum.reduceat(along, seen.starts, axis=0)
+            high = np.maximum.reduceat(along, seen.starts, axis=0)
+            sample = along[:: -(-len(along) // _SAMPLE)]
+            places = np.quantile(sample, np.clip(share + _CUTS, 0, 1), axis=0)
+            across = np.sum((low <= places[:, None]) & (high > places[:, None]), axis=1, dtype=float)
+            across += np.abs(_CUTS)[:, None]  # of equals the one nearest to the middle
+            across[np.all((high <= places[:, None]), axis=1)] = np.inf  # nothing on the right
+            best, direction = np.unravel_index(np.argmin(across), across.shape)
+            if np.isfinite(across[best, direction]):
+                place = places[best, direction]
+                of_images = low[:, direction] <= place, high[:, direction] > place
+                return _Cut(along[:, direction] <= place, *of_images)
+        return None
+
+    def _saving_cut(self, seen: "_Seen") -> "_Cut | None":
+        """Return the best cut in the middle if it saves time."""
+        cut = self._cut(seen, 0.5)
+        if cut is None:
+            return None
+
+        def cost(of: Bool[np.ndarray, " images"], whole: Bool[np.ndarray, " images"]) -> float:
+            eliminated = self.block * np.count_nonzero(of & whole)
+            rest = self.block * np.count_nonzero(of & ~whole) + self.border
+            return front_flops(eliminated, rest) + _PER_ENTRY * (eliminated + rest) ** 2 + _PER_FRONT
+
+        left, right = seen.whole & ~cut.on_right, seen.whole & ~cut.on_left
+        parts = cost(cut.on_left, left) + cost(cut.on_right, right)
+        parts += cost(cut.on_left & cut.on_right | ~seen.whole, seen.whole)
+        return cut if parts < cost(np.ones_like(seen.whole), seen.whole) else None
+
+    def _along(self, images: Int[np.ndarray, " images"]) -> Int[np.ndarray, " images"]:
+        """Order images along their longest extent, so that those which a child has in common lie side by side."""
+        centers = self.centers[images] - self.centers[images].mean(axis=0) if len(images) else np.zeros((0, 3))
+        return images[np.argsort(centers @ np.linalg.svd(centers.T @ centers)[0][:, 0], kind="stable")]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Seen:
+    """Observations of a node, sorted by image: where each image's begin, and whether they are all that it has."""
+
+    rows: Int[np.ndarray, " rows"]
+    starts: Int[np.ndarray, " images"]
+    images: Int[np.ndarray, " images"]
+    whole: Bool[np.ndarray, " images"]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Cut:
+    """Which observations fall on the left, and which images have some on the left and on the right."""
+
+    left: Bool[np.ndarray, " rows"]
+    on_left: Bool[np.ndarray, " images"]
+    on_right: Bool[np.ndarray, " images"]
+
+    @property
+    def across(self) -> Bool[np.ndarray, " images"]:
+        return self.on_left & self.on_right

@@ -1,0 +1,316 @@
+"""Steps of a block in tiles: the same as those of the block in one piece, for which no more than a few tiles are held.
+
+A step goes up the tree and down again. Up: each tile linearises its observations, eliminates its points, then its inner
+images, and hands a dense matrix over its boundary to its parent (`_fronts.py`); parents add and eliminate in turn, and
+the root solves for the border, within its bounds. Down: each node solves for its own images, each tile for its points,
+which it refines; what it takes to judge the step is summed, and the solver judges as it does in one piece.
+
+Tiles are worked on by `workers` threads, and their results taken in the order of the tree: the same bytes whatever the
+number of threads.
+"""
+
+import functools
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba.ba._compiler import call_compiled
+from jaxba.ba._factor import box_minimum
+from jaxba.ba._lengths import MIN_DIAGONAL
+from jaxba.ba._linearise import costs, linearise
+from jaxba.ba._plan import bare_shape
+from jaxba.ba._problem import Problem
+from jaxba.ba._schur import ReducedVector
+from jaxba.ba._solvers import SchurLevenbergMarquardt, State, Tried, projected_gradient_norm
+from jaxba.ba._system import System
+from jaxba.ba._unknowns import Step, Unknowns
+from jaxba.ba.tiles._cut import Tile, cut
+from jaxba.ba.tiles._dissect import Tree
+from jaxba.ba.tiles._fronts import Fronts, NotPositive, TileFronts
+from jaxba.ba.tiles._programs import Handed, Sums, hand_over, put_back
+from jaxba.ba.tiles._shelf import Shelf
+from jaxba.geometry import AbstractLoss, Pose
+
+_T = TypeVar("_T")
+
+
+class _Up(NamedTuple):
+    """What a tile gives on the way up: what it hands on, and its part of gradient and diagonal in its own order."""
+
+    update: np.ndarray
+    gradient: Step
+    squares: Step
+    steepest: float
+
+
+class Engine:
+    """A problem in tiles, ready for steps.
+
+    - `shelf`: where systems and factors lie. `models`: where equations are kept for the way down, as far as there is
+      room; what is not kept is computed again.
+    """
+
+    def __init__(
+        self, problem: Problem, loss: AbstractLoss, tree: Tree, *, shelf: Shelf, models: Shelf, workers: int
+    ) -> None:
+        shape = bare_shape(problem)
+        self.shape, self.tree, self.workers = shape, tree, workers
+        self.fronts = Fronts(tree, shape.block, shape.border)
+        self.shelf, self.models = shelf, models
+        tiles: dict[int, tuple[Tile, TileFronts]] = {}
+        for number, tile, system in cut(problem, tree, loss):
+            row, column = np.asarray(system.block_row), np.asarray(system.block_column)
+            count = int(np.count_nonzero(row != column))  # padding stands at the end
+            tiles[number] = tile, self.fronts.tile_fronts(number, tile.order, row[:count], column[:count])
+            shelf.put(("system", number), system)
+        self.tiles = [tiles[number] for number in range(len(tiles))]
+        self.camera_index = np.asarray(problem.camera_index)
+        free = problem.free
+        self.free = Step(
+            np.repeat(np.asarray(free.poses, float)[:, None], 6, axis=1),
+            np.asarray(free.intrinsics, float),
+            np.full(3, float(free.lever_arm)),
+            np.zeros((0, 3)),
+        )
+        self.lower, self.upper = np.asarray(problem.lower, float), np.asarray(problem.upper, float)
+        below = {node for _, fronts in self.tiles for node in range(fronts.first, fronts.last)}
+        self.tops = [number for number in range(len(tree.nodes)) if number not in below]
+        self.tile_of_node = {fronts.last: number for number, (_, fronts) in enumerate(self.tiles)}
+
+    def costs(self, unknowns: Unknowns) -> tuple[float, float]:
+        """Return the cost, and the cost without robust losses."""
+
+        def of_tile(number: int) -> tuple[float, float]:
+            found = call_compiled(costs, self._system(number), self.tiles[number][0].take(unknowns))
+            return float(found[0]), float(found[1])
+
+        robust, plain = np.sum(list(self._each_tile(of_tile)), axis=0)
+        return robust, plain
+
+    def step(self, solver: SchurLevenbergMarquardt, unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
+        """Return the unknowns and the state after a step was tried."""
+        damping, bend = np.asarray(state.trust), np.asarray(state.bend)
+        try:
+            gradient, steepest, border = self._up(unknowns, damping, bend)
+        except NotPositive:
+            return unknowns, call_compiled(_judge_with(solver), state, _NOTHING_TRIED)
+        trial, sums, squared_norm = self._down(unknowns, border, damping, bend)
+        of_all = Step(gradient.poses, gradient.intrinsics, gradient.lever_arm, np.array([[steepest, 0.0, 0.0]]))
+        tried = _NOTHING_TRIED._replace(
+            cost=sums.cost,
+            promised=-sums.slope - sums.curvature / 2,
+            gradient_norm=call_compiled(projected_gradient_norm, self.lower, self.upper, unknowns.intrinsics, of_all),
+            shortened=1 + damping,
+            in_sigmas=np.sqrt(sums.in_sigmas),
+            all_in_sigmas=np.sqrt(sums.all_in_sigmas),
+            norm=np.sqrt(squared_norm),
+            points_held=sums.points_held,
+        )
+        judged = call_compiled(_judge_with(solver), state, jax.tree.map(np.asarray, tried))
+        return (trial if judged.accepted else unknowns), judged
+
+    def _system(self, number: int) -> System:
+        return self.shelf.get(("system", number))
+
+    def _up(
+        self, unknowns: Unknowns, damping: Float[np.ndarray, ""], bend: Float[np.ndarray, ""]
+    ) -> tuple[Step, float, Float[np.ndarray, " border"]]:
+        """Return the gradient but for points, its largest entry there, and the border's solution; keep the factors."""
+        gradient, squares = (jax.tree.map(np.zeros_like, self.free) for _ in range(2))
+        updates: dict[int, np.ndarray] = {}
+        steepest, results = 0.0, self._each_tile(functools.partial(self._up_tile, unknowns, damping, bend))
+        for number in self.tops:
+            if number in self.tile_of_node:
+                tile, found = self.tiles[self.tile_of_node[number]][0], next(results)
+                updates[number] = found.update
+                steepest = max(steepest, found.steepest)
+                for total, part in ((gradient, found.gradient), (squares, found.squares)):
+                    total.poses[tile.order] += part.poses
+                    total.intrinsics[tile.solver_cameras] += part.intrinsics
+                    total.lever_arm[:] += part.lever_arm
+                continue
+            node = self.tree.nodes[number]
+            images, _ = self._reduced(self._damping(squares, damping), self.camera_index)
+            handed_on = [updates.pop(child) for child in node.children]
+            updates[number] = self._eliminate(number, handed_on, images[node.eliminated])
+        (top,) = updates.values()
+        _, on_border = self._reduced(self._damping(squares, damping), self.camera_index)
+        return gradient, steepest, self._border(unknowns, top, on_border)
+
+    def _up_tile(
+        self, unknowns: Unknowns, damping: Float[np.ndarray, ""], bend: Float[np.ndarray, ""], number: int
+    ) -> _Up:
+        tile, fronts = self.tiles[number]
+        system = self._system(number)
+        model = call_compiled(linearise, system, tile.take(unknowns), bend)
+        handed: Handed = jax.tree.map(np.asarray, call_compiled(hand_over, system, model, damping))
+        self.models.put(number, jax.tree.map(np.asarray, model), only_if_room=True)
+        count = len(tile.order)
+        squares, gradient = (
+            Step(part.poses[:count], part.intrinsics[: len(tile.cameras)], part.lever_arm, part.points)
+            for part in (handed.squares, handed.gradient)
+        )
+        images, _ = self._reduced(self._damping(squares, damping, tile), np.arange(count))
+        updates: dict[int, np.ndarray] = {}
+        begin = 0
+        for node_number, part in zip(range(fronts.first, fronts.last + 1), fronts.parts, strict=True):
+            node = self.tree.nodes[node_number]
+            end = begin + len(node.eliminated)
+            handed_on = [updates.pop(child) for child in node.children]
+            updates[node_number] = self._eliminate(node_number, handed_on, images[begin:end], part, handed)
+            begin = end
+        return _Up(updates[fronts.last], gradient, squares, float(handed.steepest))
+
+    def _eliminate(self, number: int, *arguments: Any) -> np.ndarray:
+        old = self.shelf.release(("factor", number))
+        if old is not None:
+            self.fronts.forget(old)
+        factor, update = self.fronts.eliminate(number, *arguments)
+        self.shelf.put(("factor", number), factor)
+        return update
+
+    def _border(
+        self, unknowns: Unknowns, top: Float[np.ndarray, "tail tail"], damping: Float[np.ndarray, " border"]
+    ) -> Float[np.ndarray, " border"]:
+        """Return the border's solution from what the root hands on."""
+        count = self.shape.border
+        if not count:
+            return np.zeros(0)
+        corner = np.tril(top[:count, :count])
+        corner = corner + np.tril(corner, -1).T + np.diag(damping)
+        lower = upper = None
+        if self.shape.any_bound:
+            lower, upper = (
+                self._reduced(Step(self.free.poses, bound - unknowns.intrinsics, far, self.free.points))[1]
+                for bound, far in ((self.lower, np.full(3, -np.inf)), (self.upper, np.full(3, np.inf)))
+            )
+        return np.asarray(call_compiled(box_minimum, corner, top[count, :count], lower, upper))
+
+    def _down(
+        self,
+        unknowns: Unknowns,
+        border: Float[np.ndarray, " border"],
+        damping: Float[np.ndarray, ""],
+        bend: Float[np.ndarray, ""],
+    ) -> tuple[Unknowns, Sums, float]:
+        """Return the unknowns after the step, what it is judged by, and its squared length."""
+        solution = np.zeros((len(self.tree.rank), self.shape.block))
+        tail = np.zeros(self.fronts.tail * self.shape.block)
+        tail[: len(border)], tail[len(border)] = border, -1
+        for number in reversed(self.tops):
+            if number not in self.tile_of_node:
+                self.fronts.put_back(number, self.shelf.get(("factor", number)), solution, tail)
+        shared = self._shared_step(unknowns, border)
+        work = functools.partial(self._down_tile, unknowns, solution, tail, shared, damping, bend)
+        trial = Unknowns(
+            Pose(unknowns.poses.quaternion.copy(), unknowns.poses.translation.copy()),
+            unknowns.intrinsics + shared.intrinsics,
+            unknowns.lever_arm + shared.lever_arm,
+            unknowns.points.copy(),
+        )
+        totals = Sums(*[np.zeros(()) for _ in Sums._fields])
+        for (tile, _), (part, sums) in zip(self.tiles, self._each_tile(work), strict=True):
+            tile.put(part, trial)
+            totals = Sums(*[total + own for total, own in zip(totals, sums, strict=True)])
+        if self.shape.own_cameras:
+            refined = np.flatnonzero(self.shape.refined)
+            trial.intrinsics[self.camera_index[:, None], refined] += solution[:, 6:]
+        squared = np.sum(solution**2) + np.sum(shared.intrinsics**2) + np.sum(shared.lever_arm**2) + totals.of_points
+        return trial, totals, float(squared)
+
+    def _down_tile(
+        self,
+        unknowns: Unknowns,
+        solution: Float[np.ndarray, "images block"],
+        tail: Float[np.ndarray, " tail"],
+        shared: Step,
+        damping: Float[np.ndarray, ""],
+        bend: Float[np.ndarray, ""],
+        number: int,
+    ) -> tuple[Unknowns, Sums]:
+        tile, fronts = self.tiles[number]
+        for node in reversed(range(fronts.first, fronts.last + 1)):
+            self.fronts.put_back(node, self.shelf.get(("factor", node)), solution, tail)
+        system, part = self._system(number), tile.take(unknowns)
+        model = self.models.get(number)
+        if model is None:
+            model = call_compiled(linearise, system, part, bend)
+        images = np.zeros((tile.plan.shape.num_images, self.shape.block))
+        images[: len(tile.order)] = solution[tile.order]
+        intrinsics = shared.intrinsics
+        if self.shape.own_cameras:
+            intrinsics = np.zeros(part.intrinsics.shape)
+            intrinsics[:, np.flatnonzero(self.shape.refined)] = images[:, 6:]
+        step = Step(images[:, :6], intrinsics, shared.lever_arm, np.zeros_like(part.points))
+        vector = ReducedVector(images, tail[: self.shape.border])
+        return jax.tree.map(np.asarray, call_compiled(put_back, system, part, model, vector, step, damping, bend))
+
+    def _shared_step(self, unknowns: Unknowns, border: Float[np.ndarray, " border"]) -> Step:
+        """Return the border's step of intrinsics and lever arm, within the bounds."""
+        shape, free = self.shape, self.free
+        intrinsics, lever_arm = np.zeros_like(free.intrinsics), np.zeros(3)
+        shared = shape.num_shared_cameras * shape.num_refined
+        if shared:
+            intrinsics[:, np.flatnonzero(shape.refined)] = border[:shared].reshape(-1, shape.num_refined)
+        if shape.lever_arm:
+            lever_arm = border[shared:]
+        if shape.any_bound:
+            moved = np.clip(unknowns.intrinsics + intrinsics, self.lower, self.upper) - unknowns.intrinsics
+            intrinsics = np.where(free.intrinsics > 0, moved, 0.0)
+        return Step(free.poses[:0], intrinsics, lever_arm, free.points)
+
+    def _reduced(
+        self, step: Step, camera_index: Int[np.ndarray, " images"] | None = None
+    ) -> tuple[Float[np.ndarray, "images block"], Float[np.ndarray, " border"]]:
+        """Return the images' and the border's part of a step, as `_schur.to_reduced` does."""
+        shape = self.shape
+        refined = step.intrinsics[:, np.flatnonzero(shape.refined)]
+        lever_arm = step.lever_arm if shape.lever_arm else step.lever_arm[:0]
+        if shape.own_cameras and camera_index is not None:
+            return np.concatenate([step.poses, refined[camera_index]], axis=1), lever_arm
+        return step.poses, np.concatenate([refined.reshape(-1) if not shape.own_cameras else lever_arm[:0], lever_arm])
+
+    def _damping(self, squares: Step, damping: Float[np.ndarray, ""], tile: Tile | None = None) -> Step:
+        """Return what is added to the diagonal of images and border, of a tile's or of all."""
+        free = self.free
+        if tile is not None:
+            free = Step(free.poses[tile.order], free.intrinsics[tile.solver_cameras], free.lever_arm, free.points)
+
+        def added(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
+            largest = squares.max(initial=0.0)
+            return damping * np.maximum(squares, MIN_DIAGONAL * largest if largest > 0 else 1.0) + (1 - free)
+
+        return jax.tree.map(added, squares, free)
+
+    def _each_tile(self, work: Callable[[int], _T]) -> Iterator[_T]:
+        """Yield the results of work on every tile, in order, a few at a time."""
+
+        def in_double(number: int) -> _T:
+            with jax.enable_x64(True):  # of this thread
+                return work(number)
+
+        waiting: deque[Future[_T]] = deque()
+        with ThreadPoolExecutor(self.workers) as pool:
+            for number in range(len(self.tiles)):
+                waiting.append(pool.submit(in_double, number))
+                if len(waiting) > self.workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+
+
+@functools.cache
+def _judge_with(solver: SchurLevenbergMarquardt) -> Callable[[State, Tried], State]:
+    return lambda state, tried: solver.judge(state, tried)
+
+
+_NOTHING_TRIED = Tried(
+    cost=np.array(np.inf), promised=np.array(np.nan), gradient_norm=np.array(np.inf), shortened=np.array(1.0),
+    in_sigmas=np.array(np.inf), all_in_sigmas=np.array(0.0), norm=np.array(np.inf), scaled_norm=np.array(0.0),
+    linear_iterations=np.array(0), points_held=np.array(0),
+)  # fmt: skip

@@ -1,0 +1,118 @@
+"""The compiled work on one tile: its equations, what it hands to the fronts, and its part of a step.
+
+Every function takes the tile's own `System` and its part of the unknowns. What tiles return adds up to what the whole
+block would give: costs, slopes, curvatures and lengths are sums over observations, gradients and diagonals of images
+and cameras sums over the tiles that see them.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.ba._lengths import all_squared_in_sigmas, slope_along, squared_in_sigmas
+from jaxba.ba._linearise import Linearisation, cost, curvature
+from jaxba.ba._refine import move_points, refine_points
+from jaxba.ba._schur import (
+    ReducedVector,
+    back_substitute,
+    eliminate,
+    eliminate_points,
+    reduce_vector,
+)
+from jaxba.ba._solvers import damped_points
+from jaxba.ba._system import System
+from jaxba.ba._unknowns import Step, Unknowns
+
+
+class Handed(NamedTuple):
+    """Blocks that a tile hands to the fronts, and its part of gradient and diagonal; images in its solver's order.
+
+    - `off_diagonal`: of the images `System.block_row` and `block_column`.
+    - `tail`: of each image border and right-hand side, transposed and padded. `corner`: of the border itself.
+    - `gradient`, `diagonal`: see `Linearisation`; those of points are left out.
+    - `steepest`: the largest entry of the points' gradient.
+    """
+
+    diagonal: Float[Array | np.ndarray, "images block block"]
+    off_diagonal: Float[Array | np.ndarray, "blocks block block"]
+    tail: Float[Array | np.ndarray, "images tail block"]
+    corner: Float[Array | np.ndarray, "tail tail"]
+    gradient: Step
+    squares: Step
+    steepest: Float[Array | np.ndarray, ""]
+
+
+class Sums(NamedTuple):
+    """A tile's part of what a step is judged by; see `_lengths.py`."""
+
+    cost: Float[Array | np.ndarray, ""]
+    slope: Float[Array | np.ndarray, ""]
+    curvature: Float[Array | np.ndarray, ""]
+    in_sigmas: Float[Array | np.ndarray, ""]
+    all_in_sigmas: Float[Array | np.ndarray, ""]
+    of_points: Float[Array | np.ndarray, ""]
+    points_held: Int[Array | np.ndarray, ""]
+
+
+def tail_size(block: int, border: int) -> int:
+    """Return border and right-hand side in blocks, rounded up."""
+    return -(-(border + 1) // block)
+
+
+def hand_over(system: System, model: Linearisation, damping: Float[Array, ""]) -> Handed:
+    """Return what a tile hands to the fronts; the damping of images and border is added there, once."""
+    shape = system.shape
+    damped, of_points = damped_points(model, damping)
+    zero = jax.tree.map(jnp.zeros_like, model.gradient)
+    unseen = of_points + (1 - system.free.points)
+    reduced = eliminate_points(system, damped, eqx.tree_at(lambda s: s.points, zero, unseen))
+    vector = reduce_vector(system, reduced.points, jax.tree.map(jnp.negative, model.gradient))
+    pad = tail_size(shape.block, shape.border) * shape.block - shape.border - 1
+    tail = jnp.concatenate([reduced.border, vector.images[:, :, None]], axis=2)
+    corner = jnp.concatenate([reduced.corner, vector.border[None]])
+    without_points = Step(model.gradient.poses, model.gradient.intrinsics, model.gradient.lever_arm, zero.points[:0])
+    return Handed(
+        reduced.diagonal,
+        reduced.off_diagonal,
+        jnp.swapaxes(jnp.pad(tail, ((0, 0), (0, 0), (0, pad))), 1, 2),
+        jnp.pad(corner, ((0, pad), (0, pad + 1))),
+        without_points,
+        eqx.tree_at(lambda s: s.points, model.diagonal, zero.points[:0]),
+        jnp.max(jnp.abs(model.gradient.points), initial=0.0),
+    )
+
+
+def put_back(
+    system: System,
+    unknowns: Unknowns,
+    model: Linearisation,
+    solution: ReducedVector,
+    step: Step,
+    damping: Float[Array, ""],
+    bend: Float[Array, ""],
+) -> tuple[Unknowns, Sums]:
+    """Return the tile's unknowns after a step, points refined, and its part of the sums.
+
+    - `solution`: of images and border. `step`: the same as a step within the bounds; its points are not read.
+    """
+    damped, of_points = damped_points(model, damping)
+    points = eliminate(damped, of_points + (1 - system.free.points))
+    whole = back_substitute(system, points, jax.tree.map(jnp.negative, model.gradient), solution)
+    step = eqx.tree_at(lambda s: s.points, step, whole.points)
+    moved = eqx.tree_at(lambda u: u.points, unknowns.retract(step), move_points(system, unknowns, step.points))
+    trial, held = refine_points(system, moved, unknowns, bend > 0)
+    sums = Sums(
+        cost=cost(system, trial),
+        slope=slope_along(model.gradient, step),
+        curvature=curvature(system, model, step),
+        in_sigmas=squared_in_sigmas(model, step),
+        all_in_sigmas=all_squared_in_sigmas(system, unknowns, model),
+        of_points=jnp.sum(step.points**2),
+        points_held=held,
+    )
+    return trial, sums

@@ -50,9 +50,9 @@ def call_compiled(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def compile_ahead(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """Return what `call_compiled` calls for arguments of these shapes."""
+    """Return what `call_compiled` calls for arguments of these shapes, which may be `jax.ShapeDtypeStruct`s."""
     leaves, structure = jax.tree.flatten(arguments)
-    shapes = tuple((np.shape(leaf), jax.numpy.result_type(leaf).name) for leaf in leaves)
+    shapes = tuple((jax.numpy.shape(leaf), jax.numpy.result_type(leaf).name) for leaf in leaves)
     return _ahead(function, structure, shapes)
 
 

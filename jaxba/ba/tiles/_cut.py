@@ -12,15 +12,14 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.ba._plan import Plan, bare_shape, make_plan
+from jaxba.ba._plan import Plan, PlanShape, bare_shape, make_plan
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._system import System, arrange, make_system, restore
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.tiles._dissect import Tree
 from jaxba.geometry import AbstractLoss, Pose
 
-_LIKE = 0.7  # of the observations of the tile that gave a shape: smaller ones get one of their own
-_ROOM = 0.12  # that a shape leaves for tiles with more points or pairs than the one that gave it
+_LIKE = 0.6  # of the observations of the largest tile of a shape: smaller ones get one of their own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +40,17 @@ class Tile:
         """Its cameras in the order of its solver."""
         return self.cameras[self.plan.camera_order]
 
+    @property
+    def shapes(self) -> Unknowns:
+        """Shapes of what `take` returns."""
+        shape = self.plan.shape
+
+        def of(*size: int) -> Any:
+            return jax.ShapeDtypeStruct(size, np.float64)
+
+        pose = Pose(of(shape.num_images, 4), of(shape.num_images, 3))
+        return Unknowns(pose, of(shape.num_cameras, len(shape.refined)), of(3), of(shape.num_points, 3))
+
     def take(self, unknowns: Unknowns) -> Unknowns:
         """Return the tile's part of all unknowns, in its solver's order."""
         poses = Pose(unknowns.poses.quaternion[self.images], unknowns.poses.translation[self.images])
@@ -56,7 +66,7 @@ class Tile:
 
 
 def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int, Tile, System]]:
-    """Return the tiles with their systems, the largest one first, each with its number."""
+    """Return the tiles with their systems, the largest ones first, each with its number."""
     shape = bare_shape(problem)
     seen = problem.observations
     tile_of_row = tree.tile_of_point[np.asarray(seen.point_index)]
@@ -67,21 +77,40 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
     unseen = np.bincount(np.asarray(seen.image_index), minlength=problem.num_images) == 0
     tile_of_prior = [_tile_of_rows(prior, owner, tree.tile_of_point) for prior in problem.priors]
     most_rows = [int(np.bincount(tiles, minlength=1).max(initial=1)) for tiles in tile_of_prior]
-    like, given_by = shape, 0
-    for number in sorted(range(len(rows_of_tile)), key=lambda k: -len(rows_of_tile[k])):
+
+    def part(number: int, like: PlanShape) -> tuple[Problem, Tile]:
         rows = rows_of_tile[number]
         images = np.unique(np.append(np.asarray(seen.image_index)[rows], np.flatnonzero(unseen & (number == 0))))
         points = np.flatnonzero(tree.tile_of_point == number)
         chosen = [np.flatnonzero(tiles == number) for tiles in tile_of_prior]
-        part, cameras = _part(problem, rows, images, points, chosen, most_rows, own_cameras=shape.own_cameras)
+        found, cameras = _part(problem, rows, images, points, chosen, most_rows, own_cameras=shape.own_cameras)
         order = np.argsort(tree.rank[images]).astype(np.int32)
-        fresh = len(rows) < _LIKE * given_by or not given_by
-        plan = make_plan(
-            part, linear_solver="dense", like=shape if fresh else like, spare=_ROOM if fresh else 0.0, image_order=order
-        )
-        if fresh:
-            like, given_by = plan.shape, len(rows)
-        yield number, Tile(images, cameras, points, images[order], plan), make_system(part, plan, loss)
+        plan = make_plan(found, linear_solver="dense", like=like, image_order=order)
+        return found, Tile(images, cameras, points, images[order], plan)
+
+    for group in _alike([len(rows) for rows in rows_of_tile]):
+        like = shape
+        for number in group:
+            like = _larger(like, part(number, shape)[1].plan.shape)
+        for number in group:
+            found, tile = part(number, like)
+            yield number, tile, make_system(found, tile.plan, loss)
+
+
+def _alike(sizes: list[int]) -> list[list[int]]:
+    """Return the tiles in groups that are to share a shape, the largest ones first."""
+    groups: list[list[int]] = []
+    for number in sorted(range(len(sizes)), key=lambda k: -sizes[k]):
+        if not groups or sizes[number] < _LIKE * sizes[groups[-1][0]]:
+            groups.append([])
+        groups[-1].append(number)
+    return groups
+
+
+def _larger(first: PlanShape, second: PlanShape) -> PlanShape:
+    """Return the larger of every size of two shapes of the same kind."""
+    names = ("num_images", "num_points", "num_rows", "num_cameras", "num_pair_runs", "num_blocks")
+    return dataclasses.replace(second, **{name: max(getattr(first, name), getattr(second, name)) for name in names})
 
 
 def _tile_of_rows(

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.ba._compiler import call_compiled
+from jaxba.ba._compiler import call_compiled, compile_ahead
 from jaxba.ba._factor import box_minimum
 from jaxba.ba._lengths import MIN_DIAGONAL
 from jaxba.ba._linearise import costs, linearise
@@ -81,6 +81,30 @@ class Engine:
         below = {node for _, fronts in self.tiles for node in range(fronts.first, fronts.last)}
         self.tops = [number for number in range(len(tree.nodes)) if number not in below]
         self.tile_of_node = {fronts.last: number for number, (_, fronts) in enumerate(self.tiles)}
+
+    def compile(self) -> None:
+        """Compile the work on tiles, two programs at a time; without it that happens at the first step."""
+        shapes = {tile.plan.shape: number for number, (tile, _) in enumerate(self.tiles)}
+
+        def of_shape(number: int) -> list[Callable[[], Any]]:
+            system, shape = self._system(number), self.tiles[number][0].plan.shape
+            number_, unknowns = np.zeros(()), self.tiles[number][0].shapes
+            model = jax.eval_shape(linearise, system, unknowns, number_)
+            vector = ReducedVector(np.zeros((shape.num_images, shape.block)), np.zeros(shape.border))
+            step = model.gradient
+            return [
+                functools.partial(compile_ahead, put_back, system, unknowns, model, vector, step, number_, number_),
+                functools.partial(compile_ahead, hand_over, system, model, number_),
+                functools.partial(compile_ahead, linearise, system, unknowns, number_),
+                functools.partial(compile_ahead, costs, system, unknowns),
+            ]
+
+        def in_double(work: Callable[[], Any]) -> None:
+            with jax.enable_x64(True):
+                work()
+
+        with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
+            list(pool.map(in_double, [work for number in shapes.values() for work in of_shape(number)]))
 
     def costs(self, unknowns: Unknowns) -> tuple[float, float]:
         """Return the cost, and the cost without robust losses."""

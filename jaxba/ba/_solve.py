@@ -92,19 +92,25 @@ def solve(
     ):
         if value not in choices:
             raise JaxbaError(f"solve: {name} {value!r}: choose one of {', '.join(choices)}.")
-    if is_traced((ftol, xtol, gtol, max_nfev)):
-        raise JaxbaError("solve: ftol, xtol, gtol or max_nfev is traced, as arguments of jit are; give numbers.")
-    require_number("solve: max_nfev", max_nfev, 1.0, 2.0**31 - 1, "give a whole number of steps, 1 or more", whole=True)
-    for name, value in (("ftol", ftol), ("xtol", xtol), ("gtol", gtol)):
-        require_tolerance(f"solve: {name}", value)
+    max_nfev = require_stops("solve", max_nfev=max_nfev, ftol=ftol, xtol=xtol, gtol=gtol)
     solver = _SOLVERS[method](rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
-    max_nfev = int(max_nfev)
     if is_traced((problem, loss)):
         return solve_traced(problem, loss, solver, plan, linear_solver, adjoint, max_nfev, callback)
     # OpenBLAS's threads fight with XLA's for the cores (with them a 144 x 144 Cholesky took 204 ms instead of 0.16 ms),
     # so OpenBLAS gets one thread for as long as this runs
     with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
         return _solve_on_host(problem, loss, solver, plan, linear_solver, max_nfev, dtype, callback)
+
+
+def require_stops(label: str, *, max_nfev: int, ftol: float, xtol: float, gtol: float) -> int:
+    """Return `max_nfev` as a number; raise `JaxbaError` for what is no limit or tolerance of a solve."""
+    if is_traced((ftol, xtol, gtol, max_nfev)):
+        raise JaxbaError(f"{label}: ftol, xtol, gtol or max_nfev is traced, as arguments of jit are; give numbers.")
+    cure = "give a whole number of steps, 1 or more"
+    require_number(f"{label}: max_nfev", max_nfev, 1.0, 2.0**31 - 1, cure, whole=True)
+    for name, value in (("ftol", ftol), ("xtol", xtol), ("gtol", gtol)):
+        require_tolerance(f"{label}: {name}", value)
+    return int(max_nfev)
 
 
 def _name_of(dtype: Any) -> str:

@@ -133,6 +133,14 @@ def initial_unknowns(problem: Problem, plan: Plan, dtype: Any = np.float64) -> U
     return arrange(Unknowns(problem.poses, parameters, problem.lever_arm, problem.points), plan, dtype)
 
 
+def own_unknowns(problem: Problem) -> Unknowns:
+    """Return a problem's start values in its own order, as numpy arrays of their own."""
+    names = type(problem.cameras).parameter_names()
+    intrinsics = np.stack([np.asarray(getattr(problem.cameras, name), float) for name in names], axis=-1)
+    poses = Pose(np.array(problem.poses.quaternion, float), np.array(problem.poses.translation, float))
+    return Unknowns(poses, intrinsics, np.array(problem.lever_arm, float), np.array(problem.points, float))
+
+
 def arrange(unknowns: Unknowns, plan: Plan, dtype: Any = np.float64) -> Unknowns:
     """Return unknowns in the problem's order in the solver's, with padding."""
     xp = _namespace((unknowns, plan))

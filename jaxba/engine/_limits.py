@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxba._errors import JaxbaError
-from jaxba.engine._workers import Resources, bytes_of
+from jaxba._sizes import bytes_of, size_text
+from jaxba.engine._workers import Resources
 from jaxba.scene import LeftOut
 
 _SHOWN = 3
@@ -52,13 +53,3 @@ def _reasons(failed: Sequence[LeftOut]) -> str:
     ]
     rest = len(commonest) - _SHOWN
     return "; ".join(texts) + (f"; and {rest} other reasons" if rest > 0 else "")
-
-
-def size_text(count: float) -> str:
-    """Return bytes in words.
-
-    >>> size_text(150e6)
-    '150.0 MB'
-    """
-    unit, name = next(((u, n) for u, n in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if count >= u), (1e3, "kB"))
-    return f"{count / unit:.1f} {name}"

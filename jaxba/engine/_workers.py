@@ -1,20 +1,15 @@
 """Settings of the worker processes: what they may use, how long a photo may take, how many photos may fail."""
 
 import os
-import re
 from dataclasses import dataclass
-from pathlib import Path
-
-import psutil
 
 from jaxba._errors import JaxbaError
+from jaxba._sizes import bytes_of, machine_memory
 from jaxba.engine._parameters import Parameters, parameter
 
 _BASE_GB, _GB_PER_MEGAPIXEL = 0.35, 0.25  # SIFT holds 1.25 GB at 5 megapixels and 4.6 GB at 20
 _BASE_S, _S_PER_EFFORT = 60.0, 10.0  # SIFT takes 0.7 s a megapixel, two photos of 8000 features 0.5 s, on an idle core
-_AMOUNT = re.compile(r"(\d+(?:\.\d*)?(?:e\d+)?)\s*([kmgt]i?)?b?", re.IGNORECASE)
 _LEAST_MEMORY, _LEAST_STORE = 1e8, 1e6
-_CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")  # version 2, 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,31 +66,6 @@ class Resources(Parameters):
 def memory_for(megapixels: float) -> float:
     """Return the bytes that a worker needs for photos of this size."""
     return (_BASE_GB + _GB_PER_MEGAPIXEL * megapixels) * 1e9
-
-
-def machine_memory() -> float:
-    """Return the bytes of memory that the machine has, or the container that this runs in."""
-    total = float(psutil.virtual_memory().total)
-    for path in map(Path, _CONTAINER_LIMITS):
-        text = path.read_text().strip() if path.is_file() else ""
-        total = min(total, float(text)) if text.isdigit() else total  # `max`: no limit
-    return total
-
-
-def bytes_of(amount: float | str, whole: float) -> float:
-    """Return the bytes that `0.8` (a share of the whole), `4e9`, `4GB`, `800 MB` or `2GiB` mean; nan for other texts.
-
-    >>> bytes_of("0.5", 16e9), bytes_of("4GB", 16e9), bytes_of("1KiB", 16e9)
-    (8000000000.0, 4000000000.0, 1024.0)
-    """
-    found = _AMOUNT.fullmatch(str(amount).strip())
-    if found is None:
-        return float("nan")
-    number, unit = float(found[1]), (found[2] or "").lower()
-    if not unit:
-        return number * whole if number <= 1 else number
-    base = 1024 if unit.endswith("i") else 1000
-    return number * base ** ("kmgt".index(unit[0]) + 1)
 
 
 def _check_amount(name: str, amount: float | str, *, most_share: float, least_bytes: float) -> None:

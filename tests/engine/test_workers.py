@@ -2,8 +2,9 @@ import psutil
 import pytest
 
 from jaxba import JaxbaError
+from jaxba._sizes import bytes_of, machine_memory
 from jaxba.engine import Resources, _workers, changed
-from jaxba.engine._workers import bytes_of, machine_memory, memory_for
+from jaxba.engine._workers import memory_for
 from jaxba.pipeline import PIPELINE
 
 
@@ -39,7 +40,7 @@ def test_the_settings_take_amounts_as_texts():
 @pytest.mark.parametrize(("text", "limited"), [("4000000000\n", True), ("max\n", False)])
 def test_memory_is_that_of_the_container(tmp_path, monkeypatch: pytest.MonkeyPatch, text: str, limited: bool):
     (tmp_path / "memory.max").write_text(text)
-    monkeypatch.setattr(_workers, "_CONTAINER_LIMITS", (tmp_path / "memory.max", tmp_path / "gone"))
+    monkeypatch.setattr(_sizes, "_CONTAINER_LIMITS", (tmp_path / "memory.max", tmp_path / "gone"))
     assert machine_memory() == (4_000_000_000 if limited else psutil.virtual_memory().total)
 
 

@@ -13,6 +13,7 @@ import functools
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -29,6 +30,7 @@ from jaxba.ba._schur import ReducedVector
 from jaxba.ba._solvers import SchurLevenbergMarquardt, State, Tried, projected_gradient_norm
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
+from jaxba.ba.tiles._budget import Budget
 from jaxba.ba.tiles._cut import Tile, cut
 from jaxba.ba.tiles._dissect import Tree
 from jaxba.ba.tiles._fronts import Fronts, NotPositive, TileFronts
@@ -51,23 +53,28 @@ class _Up(NamedTuple):
 class Engine:
     """A problem in tiles, ready for steps.
 
-    - `shelf`: where systems and factors lie. `models`: where equations are kept for the way down, as far as there is
-      room; what is not kept is computed again.
+    - `budget`: how much of systems, factors and equations stays in memory. `folder`: for files of the rest.
     """
 
     def __init__(
-        self, problem: Problem, loss: AbstractLoss, tree: Tree, *, shelf: Shelf, models: Shelf, workers: int
+        self,
+        problem: Problem,
+        loss: AbstractLoss,
+        tree: Tree,
+        fronts: Fronts,
+        budget: Budget,
+        folder: Path,
+        workers: int,
     ) -> None:
-        shape = bare_shape(problem)
-        self.shape, self.tree, self.workers = shape, tree, workers
-        self.fronts = Fronts(tree, shape.block, shape.border)
-        self.shelf, self.models = shelf, models
+        self.shape, self.tree, self.fronts, self.workers = bare_shape(problem), tree, fronts, workers
+        self.shelf, self.models = Shelf(budget.shelf, folder), Shelf(budget.models)
+        fronts.memory.limit = budget.idle
         tiles: dict[int, tuple[Tile, TileFronts]] = {}
         for number, tile, system in cut(problem, tree, loss):
             row, column = np.asarray(system.block_row), np.asarray(system.block_column)
             count = int(np.count_nonzero(row != column))  # padding stands at the end
-            tiles[number] = tile, self.fronts.tile_fronts(number, tile.order, row[:count], column[:count])
-            shelf.put(("system", number), system)
+            tiles[number] = tile, fronts.tile_fronts(number, tile.order, row[:count], column[:count])
+            self.shelf.put(("system", number), system)
         self.tiles = [tiles[number] for number in range(len(tiles))]
         self.camera_index = np.asarray(problem.camera_index)
         free = problem.free
@@ -173,7 +180,7 @@ class Engine:
         system = self._system(number)
         model = call_compiled(linearise, system, tile.take(unknowns), bend)
         handed: Handed = jax.tree.map(np.asarray, call_compiled(hand_over, system, model, damping))
-        self.models.put(number, jax.tree.map(np.asarray, model), only_if_room=True)
+        self.models.put(number, jax.tree.map(np.asarray, model))
         count = len(tile.order)
         squares, gradient = (
             Step(part.poses[:count], part.intrinsics[: len(tile.cameras)], part.lever_arm, part.points)
@@ -195,7 +202,8 @@ class Engine:
         if old is not None:
             self.fronts.forget(old)
         factor, update = self.fronts.eliminate(number, *arguments)
-        self.shelf.put(("factor", number), factor)
+        if not self.shelf.put(("factor", number), factor):
+            self.fronts.forget(factor)
         return update
 
     def _border(

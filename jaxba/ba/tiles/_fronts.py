@@ -16,6 +16,7 @@ the arithmetic, each front at its own size. Sizes are counted in blocks of an im
 padded; lower triangles alone are filled.
 """
 
+import itertools
 import threading
 from typing import NamedTuple
 
@@ -76,18 +77,18 @@ class _Memory:
     """Matrices whose memory is used again: to touch fresh memory takes longer than to fill it and compute with it."""
 
     def __init__(self) -> None:
+        self.limit = np.inf
         self._free: list[np.ndarray] = []
         self._lock = threading.Lock()
 
-    def zeros(self, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
+    def take(self, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
+        """Return a matrix with anything in it."""
         size = rows * columns
         with self._lock:
             fitting = [i for i, buffer in enumerate(self._free) if size <= len(buffer) <= 2 * size]
             chosen = min(fitting, key=lambda i: len(self._free[i]), default=None)
             buffer = np.empty(size) if chosen is None else self._free.pop(chosen)
-        matrix = buffer[:size].reshape(rows, columns)
-        matrix[:] = 0
-        return matrix
+        return buffer[:size].reshape(rows, columns)
 
     def give_back(self, matrix: Float[np.ndarray, "rows columns"]) -> None:
         buffer = matrix
@@ -95,6 +96,22 @@ class _Memory:
             buffer = buffer.base
         with self._lock:
             self._free.append(buffer)
+            while sum(buffer.nbytes for buffer in self._free) > self.limit:
+                self._free.pop(0)
+
+    def zeros(self, rows: int, columns: int) -> Float[np.ndarray, "rows columns"]:
+        """Return a matrix of zeros."""
+        matrix = self.take(rows, columns)
+        matrix[:] = 0
+        return matrix
+
+    def lower_zeros(self, size: int) -> Float[np.ndarray, "size size"]:
+        """Return a matrix with zeros in its lower triangle."""
+        matrix = self.take(size, size)
+        ends = np.linspace(0, size, 9).astype(int)
+        for begin, end in itertools.pairwise(ends):
+            matrix[begin:end, :end] = 0
+        return matrix
 
 
 class Fronts:
@@ -112,7 +129,7 @@ class Fronts:
         for number, node in enumerate(tree.nodes):
             parent[list(node.children)] = number
         self.parent = parent
-        self._memory = _Memory()
+        self.memory = _Memory()
         self._runs = [self._runs_of(number) for number in range(len(tree.nodes))]
 
     def tile_fronts(
@@ -167,8 +184,8 @@ class Fronts:
         block, own = self.block, self.own[number]
         rest = len(self.ranks[number]) - own + self.tail
         own_size, rest_size = own * block, rest * block
-        f22 = self._memory.zeros(rest_size, rest_size)
-        parts = self._memory.zeros(own_size, own_size), self._memory.zeros(rest_size, own_size), f22
+        f22 = self.memory.lower_zeros(rest_size)
+        parts = self.memory.lower_zeros(own_size), self.memory.zeros(rest_size, own_size), f22
         if part is not None and handed is not None:
             self._add_blocks(parts, own, part, handed)
             if part.with_corner:
@@ -176,7 +193,7 @@ class Fronts:
                 f22[-tail:, -tail:] += handed.corner
         for child, update in zip(self.tree.nodes[number].children, handed_on, strict=True):
             self._extend_add(parts, own, self._runs[child], update)
-            self._memory.give_back(update)
+            self.memory.give_back(update)
         f11, f21, _ = parts
         if not own:
             return Factor(f11.T, f21.T), f22
@@ -205,7 +222,19 @@ class Fronts:
     def forget(self, factor: Factor) -> None:
         """Take back the memory of a factor that is no longer needed."""
         for matrix in factor:
-            self._memory.give_back(matrix)
+            self.memory.give_back(matrix)
+
+    def bytes_in_work(self, workers: int) -> float:
+        """Return the most that fronts take at a time: those that wait, and the one in work with its factor."""
+        block, own = self.block, np.array(self.own, float)
+        rest = np.array([len(ranks) for ranks in self.ranks]) - own + self.tail
+        handed, whole = 8 * (rest * block) ** 2, 8 * ((own + rest) * block) ** 2
+        waiting, most = 0.0, 0.0
+        for number, node in enumerate(self.tree.nodes):
+            most = max(most, waiting + whole[number])
+            waiting += handed[number] - sum(handed[list(node.children)])
+        ahead = sorted(whole[list(self.tree.tiles)])[-2 * workers :]  # tiles that are done before their turn
+        return float(most + sum(ahead))
 
     def bytes_of_factors(self) -> int:
         """Return what all factors take."""

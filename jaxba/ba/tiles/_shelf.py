@@ -1,5 +1,6 @@
 """Shelf: arrays kept in memory up to a limit, and beyond it in files."""
 
+import shutil
 import threading
 from collections.abc import Hashable
 from pathlib import Path
@@ -8,9 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxba._errors import JaxbaError
+from jaxba._sizes import size_text
+
 
 class Shelf:
-    """Trees of arrays by key. What does not fit in `limit` bytes goes to files in `folder`.
+    """Trees of arrays by key. What does not fit in `limit` bytes goes to files in `folder`, or is not kept without one.
 
     Not more than one thread may use a key at a time.
     """
@@ -22,8 +26,11 @@ class Shelf:
         self._used = 0
         self._lock = threading.Lock()
 
-    def put(self, key: Hashable, tree: Any, *, only_if_room: bool = False) -> None:
-        """Keep a tree of numpy arrays; with `only_if_room` not at all where it does not fit in memory."""
+    def put(self, key: Hashable, tree: Any) -> bool:
+        """Keep a tree of numpy arrays, and return whether it stays in memory; without a folder others are forgotten.
+
+        Raises `JaxbaError` where the disk is full.
+        """
         size = sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
         with self._lock:
             self._drop(key)
@@ -31,8 +38,9 @@ class Shelf:
             if fits:
                 self._kept[key] = tree
                 self._used += size
-        if not fits and not only_if_room:
-            self._file(key, tree)
+        if not fits and self._folder is not None:
+            self._file(key, tree, self._folder)
+        return fits
 
     def get(self, key: Hashable) -> Any:
         """Return a tree, or None."""
@@ -54,11 +62,17 @@ class Shelf:
         if key in self._kept:
             self._used -= sum(leaf.nbytes for leaf in jax.tree.leaves(self._kept.pop(key)))
 
-    def _file(self, key: Hashable, tree: Any) -> None:
-        assert self._folder is not None
+    def _file(self, key: Hashable, tree: Any, folder: Path) -> None:
         leaves, structure = jax.tree.flatten(tree)
         name = "-".join(str(part) for part in (key if isinstance(key, tuple) else (key,)))
-        paths = [self._folder / f"{name}-{i}.npy" for i in range(len(leaves))]
-        for path, leaf in zip(paths, leaves, strict=True):
-            np.save(path, leaf)
+        paths = [folder / f"{name}-{i}.npy" for i in range(len(leaves))]
+        try:
+            for path, leaf in zip(paths, leaves, strict=True):
+                np.save(path, leaf)
+        except OSError as error:
+            size, free = sum(leaf.nbytes for leaf in leaves), shutil.disk_usage(folder).free
+            raise JaxbaError(
+                f"{folder}: {size_text(size)} of a tile could not be written ({error.strerror}); {size_text(free)} are "
+                "free there. Make room, give a folder on another disk, or more memory (max_memory)."
+            ) from error
         self._filed[key] = structure, paths

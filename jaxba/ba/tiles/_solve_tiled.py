@@ -1,81 +1,113 @@
-"""`solve_tiled`: the adjustment of `solve`, tile by tile."""
+"""`solve_tiled`: the adjustment of `solve`, tile by tile, in as much memory as it is given."""
 
 import os
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from jaxba._errors import JaxbaError
 from jaxba.ba._descend import walk
 from jaxba.ba._plan import bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
+from jaxba.ba._solve import require_stops
 from jaxba.ba._solvers import SchurLevenbergMarquardt
-from jaxba.ba._system import centred, from_centred
-from jaxba.ba._unknowns import Unknowns
+from jaxba.ba._system import centred, from_centred, is_traced, own_unknowns
 from jaxba.ba.checks import prepare
+from jaxba.ba.tiles._budget import memory_limit, plan_memory
 from jaxba.ba.tiles._dissect import dissect
 from jaxba.ba.tiles._engine import Engine
-from jaxba.ba.tiles._shelf import Shelf
-from jaxba.geometry import AbstractLoss, Linear, Pose, check_loss
+from jaxba.ba.tiles._fronts import Fronts
+from jaxba.geometry import AbstractLoss, Linear, check_loss, require_number
 
 
 def solve_tiled(
     problem: Problem,
     *,
     loss: AbstractLoss | None = None,
-    num_tiles: int = 1,
+    max_memory: float | str | None = None,
     max_observations: float = 1e5,
+    num_tiles: int = 1,
+    folder: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
     max_nfev: int = 500,
     ftol: float = 1e-8,
     xtol: float = 1e-8,
     gtol: float = 1e-10,
     callback: Callable[[HistoryStep], None] | None = None,
-    workers: int = 2,
 ) -> Solution:
+    """Adjust a problem in tiles: the same steps, and the same solution, as `solve` with Levenberg-Marquardt.
+
+    Blocks of more than some thousand images are faster so, and need no more memory than `max_memory`.
+
+    - `loss`, `max_nfev`, `ftol`, `xtol`, `gtol`, `callback`: as in `solve`.
+    - `max_memory`: that the process may hold, as bytes, as a text such as `4GB`, or as a share of the machine's; 80% of
+      what is free if None. What does not fit lies in files meanwhile.
+    - `max_observations`: of a tile. `num_tiles`: at least so many tiles.
+    - `folder`: for these files; the system's own for such files if None. They are gone at the end.
+    - `workers`: tiles that are worked on at a time; as many as there are cores if None. It does not change the result.
+
+    Raises `JaxbaError` as `solve` does, and where memory or disk do not suffice. It works on concrete values only.
+
+    >>> import jaxba
+    >>> survey = jaxba.synthetic.uav_block(30)
+    >>> whole, tiled = jaxba.solve(survey.problem), jaxba.solve_tiled(survey.problem, num_tiles=2)
+    >>> bool(abs(whole.final_cost - tiled.final_cost) < 1e-9 * whole.final_cost)
+    True
+    """
+    begun = time.perf_counter()
     loss = Linear() if loss is None else loss
     check_loss("solve_tiled: loss", loss)
-    begun = time.perf_counter()
+    if is_traced((problem, loss)):
+        raise JaxbaError("solve_tiled: the problem is traced, as inside jit, vmap and derivatives; use solve there.")
+    max_nfev = require_stops("solve_tiled", max_nfev=max_nfev, ftol=ftol, xtol=xtol, gtol=gtol)
+    solver = SchurLevenbergMarquardt(rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
+    require_number("solve_tiled: max_observations", max_observations, 1.0, np.inf, "give a number of observations")
+    require_number("solve_tiled: num_tiles", num_tiles, 1.0, 2.0**31 - 1, "give a whole number, 1 or more", whole=True)
+    workers = (os.cpu_count() or 1) if workers is None else workers
+    require_number("solve_tiled: workers", workers, 1.0, 1024.0, "give a whole number, 1 or more", whole=True)
+    limit = memory_limit(max_memory)
+
     prepared = prepare(problem)
     problem = prepared.problem
     near, origin = centred(problem)
     shape = bare_shape(near)
-    solver = SchurLevenbergMarquardt(rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
-    with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
+    with (
+        jax.enable_x64(True),
+        threadpool_limits(workers, user_api="blas"),
+        tempfile.TemporaryDirectory(prefix="jaxba-", dir=folder) as files,
+    ):
         tree = dissect(
-            near, block=shape.block, border=shape.border, max_observations=max_observations, num_tiles=num_tiles
+            near, block=shape.block, border=shape.border, max_observations=max_observations, num_tiles=int(num_tiles)
         )
-        engine = Engine(near, loss, tree, shelf=Shelf(), models=Shelf(), workers=workers)
+        fronts = Fronts(tree, shape.block, shape.border)
+        of_tiles = np.bincount(tree.tile_of_point[np.asarray(near.observations.point_index)])
+        budget = plan_memory(near, fronts, limit, float(of_tiles.max()), int(workers))
+        engine = Engine(near, loss, tree, fronts, budget, Path(files), int(workers))
         start = own_unknowns(near)
-        seconds_setup = time.perf_counter() - begun
+        set_up = time.perf_counter()
         engine.compile()
-        compiled_at = time.perf_counter()
-        cost, plain = engine.costs(start)
-        state = jax.device_get(solver.state_of(np.asarray(cost)))
+        compiled = time.perf_counter()
+        costs = engine.costs(start)
+        state = jax.device_get(solver.state_of(np.asarray(costs[0])))
         found, state, history, interrupted = walk(
             start, state, lambda unknowns, state: engine.step(solver, unknowns, state), max_nfev, callback
         )
-        final_plain = engine.costs(found)[1]
+        costs = (costs[0], state.cost, costs[1], engine.costs(found)[1])
     report = Report(
         history=tuple(history),
         dropped=prepared.dropped,
-        seconds_setup=seconds_setup,
-        seconds_compile=compiled_at - begun - seconds_setup,
-        seconds_solve=time.perf_counter() - compiled_at,
-        linear_solver="tiled",
+        seconds_setup=set_up - begun,
+        seconds_compile=compiled - set_up,
+        seconds_solve=time.perf_counter() - compiled,
+        linear_solver="tiles",
         interrupted=interrupted,
         problem=problem,
     )
-    costs = (cost, float(state.cost), plain, final_plain)
     on_host = [np.asarray(value) for value in (*costs, state.status, state.num_steps)]
     return Solution.of(problem, from_centred(found, origin), on_host[:4], on_host[4], on_host[5], report)
-
-
-def own_unknowns(problem: Problem) -> Unknowns:
-    """Return a problem's start values in its own order, as numpy arrays."""
-    names = type(problem.cameras).parameter_names()
-    intrinsics = np.stack([np.asarray(getattr(problem.cameras, name), float) for name in names], axis=-1)
-    poses = Pose(np.array(problem.poses.quaternion, float), np.array(problem.poses.translation, float))
-    return Unknowns(poses, intrinsics, np.array(problem.lever_arm, float), np.array(problem.points, float))

@@ -1,9 +1,9 @@
 """Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
 
+from jaxba._sizes import bytes_of, machine_memory, size_text
 from jaxba.engine import _pool
-from jaxba.engine._limits import size_text
 from jaxba.engine._words import some
-from jaxba.engine._workers import Resources, bytes_of, machine_memory, memory_for
+from jaxba.engine._workers import Resources, memory_for
 from jaxba.report._recorded import Recorded
 from jaxba.report.diagnosis._diagnosis import Diagnosis
 from jaxba.scene import LeftOut

@@ -24,6 +24,7 @@ from jaxba.ba.groups import (
     LeverArmPrior,
     PositionPrior,
 )
+from jaxba.ba.tiles import solve_tiled
 
 __all__ = [
     "PRIORS",
@@ -69,5 +70,6 @@ __all__ = [
     "residuals",
     "solve",
     "solve_and_reject",
+    "solve_tiled",
     "tune",
 ]

@@ -121,7 +121,7 @@ def back_substitute(system: System, points: Eliminated, rhs: Step, solution: Red
     moved = w_product(system, points.w, solution.images)
     moved = segments(moved, system.reprojection.point_index, system.shape.num_points)
     moved += points.shared @ solution.border[: points.shared.shape[-1]]
-    solved = _solve_roots(points.root, rhs.points - moved)
+    solved = _solve_roots(points.root, jnp.asarray(rhs.points) - moved)
     return eqx.tree_at(lambda s: s.points, from_reduced(system, solution, rhs), solved)
 
 

@@ -17,7 +17,7 @@ _BYTES_PER_OBSERVATION = 1300.0  # of a tile in work: equations, W and Z, pairs
 _BYTES_PER_POINT = 200.0  # of all points: unknowns before and after, and in turn those of the tiles
 _COMPILED = 3e8  # compiled programs and what XLA keeps
 _SHARE = 0.8  # of the free memory, where no limit is given
-_USED = 0.9  # of what is left: the allocator keeps some of it in pieces
+_USED = 0.8  # of what is left: the allocator keeps some of it in pieces
 _SYSTEM = 130.0  # bytes an observation in a system
 
 

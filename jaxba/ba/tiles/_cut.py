@@ -40,17 +40,6 @@ class Tile:
         """Its cameras in the order of its solver."""
         return self.cameras[self.plan.camera_order]
 
-    @property
-    def shapes(self) -> Unknowns:
-        """Shapes of what `take` returns."""
-        shape = self.plan.shape
-
-        def of(*size: int) -> Any:
-            return jax.ShapeDtypeStruct(size, np.float64)
-
-        pose = Pose(of(shape.num_images, 4), of(shape.num_images, 3))
-        return Unknowns(pose, of(shape.num_cameras, len(shape.refined)), of(3), of(shape.num_points, 3))
-
     def take(self, unknowns: Unknowns) -> Unknowns:
         """Return the tile's part of all unknowns, in its solver's order."""
         poses = Pose(unknowns.poses.quaternion[self.images], unknowns.poses.translation[self.images])
@@ -131,7 +120,7 @@ def _part(
     rows: Int[np.ndarray, " rows"],
     images: Int[np.ndarray, " images"],
     points: Int[np.ndarray, " points"],
-    chosen: list[Int[np.ndarray, " rows"]],
+    chosen: list[Int[np.ndarray, " _"]],
     most_rows: list[int],
     *,
     own_cameras: bool,

@@ -62,9 +62,10 @@ def dissect(problem: Problem, *, block: int, border: int, max_observations: floa
     return _Dissection(problem, block, border, max_observations).tree(num_tiles)
 
 
-def front_flops(eliminated: float, rest: float) -> float:
+def front_flops(eliminated: int | np.integer, rest: int | np.integer) -> float:
     """Return the flops of one front, Cholesky and the update of what is handed on, from its numbers of unknowns."""
-    return eliminated**3 / 3 + eliminated**2 * rest + eliminated * rest**2
+    e, r = float(eliminated), float(rest)
+    return e**3 / 3 + e**2 * r + e * r**2
 
 
 class _Dissection:

@@ -26,7 +26,6 @@ from jaxba.ba._lengths import MIN_DIAGONAL
 from jaxba.ba._linearise import costs, linearise
 from jaxba.ba._plan import bare_shape
 from jaxba.ba._problem import Problem
-from jaxba.ba._schur import ReducedVector
 from jaxba.ba._solvers import SchurLevenbergMarquardt, State, Tried, projected_gradient_norm
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
@@ -89,29 +88,29 @@ class Engine:
         self.tops = [number for number in range(len(tree.nodes)) if number not in below]
         self.tile_of_node = {fronts.last: number for number, (_, fronts) in enumerate(self.tiles)}
 
-    def compile(self) -> None:
+    def compile(self, unknowns: Unknowns) -> None:
         """Compile the work on tiles, two programs at a time; without it that happens at the first step."""
-        shapes = {tile.plan.shape: number for number, (tile, _) in enumerate(self.tiles)}
+        one_of_shape = {tile.plan.shape: number for number, (tile, _) in enumerate(self.tiles)}
 
-        def of_shape(number: int) -> list[Callable[[], Any]]:
-            system, shape = self._system(number), self.tiles[number][0].plan.shape
-            number_, unknowns = np.zeros(()), self.tiles[number][0].shapes
-            model = jax.eval_shape(linearise, system, unknowns, number_)
-            vector = ReducedVector(np.zeros((shape.num_images, shape.block)), np.zeros(shape.border))
-            step = model.gradient
-            return [
-                functools.partial(compile_ahead, put_back, system, unknowns, model, vector, step, number_, number_),
-                functools.partial(compile_ahead, hand_over, system, model, number_),
-                functools.partial(compile_ahead, linearise, system, unknowns, number_),
-                functools.partial(compile_ahead, costs, system, unknowns),
-            ]
-
-        def in_double(work: Callable[[], Any]) -> None:
-            with jax.enable_x64(True):
-                work()
+        def compile_one(program: Callable[..., Any], *arguments: Any) -> None:
+            with jax.enable_x64(True):  # of this thread
+                compile_ahead(program, *arguments)
 
         with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
-            list(pool.map(in_double, [work for number in shapes.values() for work in of_shape(number)]))
+            done = []
+            for shape, number in one_of_shape.items():
+                system, part, scalar = self._system(number), self.tiles[number][0].take(unknowns), np.zeros(())
+                model = jax.eval_shape(linearise, system, part, scalar)
+                solution = np.zeros((shape.num_images, shape.block)), np.zeros(shape.border)
+                of_step = system, part, model, *solution, model.gradient, scalar, scalar
+                done += [
+                    pool.submit(compile_one, put_back, *of_step),
+                    pool.submit(compile_one, hand_over, system, model, scalar),
+                    pool.submit(compile_one, linearise, system, part, scalar),
+                    pool.submit(compile_one, costs, system, part),
+                ]
+            for each in done:
+                each.result()
 
     def costs(self, unknowns: Unknowns) -> tuple[float, float]:
         """Return the cost, and the cost without robust losses."""
@@ -129,19 +128,21 @@ class Engine:
         try:
             gradient, steepest, border = self._up(unknowns, damping, bend)
         except NotPositive:
-            return unknowns, call_compiled(_judge_with(solver), state, _NOTHING_TRIED)
+            return unknowns, call_compiled(_judge_with(solver), state, jax.tree.map(np.asarray, _NOTHING_TRIED))
         trial, sums, squared_norm = self._down(unknowns, border, damping, bend)
         of_all = Step(gradient.poses, gradient.intrinsics, gradient.lever_arm, np.array([[steepest, 0.0, 0.0]]))
-        tried = _NOTHING_TRIED._replace(
-            cost=sums.cost,
-            promised=-sums.slope - sums.curvature / 2,
-            gradient_norm=call_compiled(projected_gradient_norm, self.lower, self.upper, unknowns.intrinsics, of_all),
-            shortened=1 + damping,
-            in_sigmas=np.sqrt(sums.in_sigmas),
-            all_in_sigmas=np.sqrt(sums.all_in_sigmas),
-            norm=np.sqrt(squared_norm),
-            points_held=sums.points_held,
-        )
+        tried = _NOTHING_TRIED | {
+            "cost": sums.cost,
+            "promised": -sums.slope - sums.curvature / 2,
+            "gradient_norm": call_compiled(
+                projected_gradient_norm, self.lower, self.upper, unknowns.intrinsics, of_all
+            ),
+            "shortened": 1 + damping,
+            "in_sigmas": np.sqrt(sums.in_sigmas),
+            "all_in_sigmas": np.sqrt(sums.all_in_sigmas),
+            "norm": np.sqrt(squared_norm),
+            "points_held": int(sums.points_held),
+        }
         judged = call_compiled(_judge_with(solver), state, jax.tree.map(np.asarray, tried))
         return (trial if judged.accepted else unknowns), judged
 
@@ -279,8 +280,8 @@ class Engine:
             intrinsics = np.zeros(part.intrinsics.shape)
             intrinsics[:, np.flatnonzero(self.shape.refined)] = images[:, 6:]
         step = Step(images[:, :6], intrinsics, shared.lever_arm, np.zeros_like(part.points))
-        vector = ReducedVector(images, tail[: self.shape.border])
-        return jax.tree.map(np.asarray, call_compiled(put_back, system, part, model, vector, step, damping, bend))
+        solved = images, tail[: self.shape.border]
+        return jax.tree.map(np.asarray, call_compiled(put_back, system, part, model, *solved, step, damping, bend))
 
     def _shared_step(self, unknowns: Unknowns, border: Float[np.ndarray, " border"]) -> Step:
         """Return the border's step of intrinsics and lever arm, within the bounds."""
@@ -302,10 +303,12 @@ class Engine:
         """Return the images' and the border's part of a step, as `_schur.to_reduced` does."""
         shape = self.shape
         refined = step.intrinsics[:, np.flatnonzero(shape.refined)]
-        lever_arm = step.lever_arm if shape.lever_arm else step.lever_arm[:0]
+        lever_arm = np.asarray(step.lever_arm if shape.lever_arm else step.lever_arm[:0])
         if shape.own_cameras and camera_index is not None:
             return np.concatenate([step.poses, refined[camera_index]], axis=1), lever_arm
-        return step.poses, np.concatenate([refined.reshape(-1) if not shape.own_cameras else lever_arm[:0], lever_arm])
+        return np.asarray(step.poses), np.concatenate(
+            [refined.reshape(-1) if not shape.own_cameras else lever_arm[:0], lever_arm]
+        )
 
     def _damping(self, squares: Step, damping: Float[np.ndarray, ""], tile: Tile | None = None) -> Step:
         """Return what is added to the diagonal of images and border, of a tile's or of all."""
@@ -337,12 +340,12 @@ class Engine:
 
 
 @functools.cache
-def _judge_with(solver: SchurLevenbergMarquardt) -> Callable[[State, Tried], State]:
-    return lambda state, tried: solver.judge(state, tried)
+def _judge_with(solver: SchurLevenbergMarquardt) -> Callable[[State, dict[str, Any]], State]:
+    return lambda state, tried: solver.judge(state, Tried(**tried))
 
 
-_NOTHING_TRIED = Tried(
-    cost=np.array(np.inf), promised=np.array(np.nan), gradient_norm=np.array(np.inf), shortened=np.array(1.0),
-    in_sigmas=np.array(np.inf), all_in_sigmas=np.array(0.0), norm=np.array(np.inf), scaled_norm=np.array(0.0),
-    linear_iterations=np.array(0), points_held=np.array(0),
-)  # fmt: skip
+_NOTHING_TRIED: dict[str, Any] = {
+    "cost": np.inf, "promised": np.nan, "gradient_norm": np.inf, "shortened": 1.0, "in_sigmas": np.inf,
+    "all_in_sigmas": 0.0, "norm": np.inf, "scaled_norm": 0.0, "linear_iterations": 0, "points_held": 0,
+}  # fmt: skip
+"""Of a step that could not be computed."""

@@ -22,10 +22,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import blas, lapack
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from jaxba.ba.tiles._dissect import Tree
 from jaxba.ba.tiles._programs import Handed, tail_size
+
+(_potrf,) = get_lapack_funcs(("potrf",), dtype=np.float64)
+_trsm, _syrk, _trsv = get_blas_funcs(("trsm", "syrk", "trsv"), dtype=np.float64)
 
 
 class Factor(NamedTuple):
@@ -169,7 +172,7 @@ class Fronts:
     def eliminate(
         self,
         number: int,
-        handed_on: list[Float[np.ndarray, "rest rest"]],
+        handed_on: list[Float[np.ndarray, "_ _"]],
         diagonal: Float[np.ndarray, "own block"],
         part: Part | None = None,
         handed: Handed | None = None,
@@ -191,18 +194,19 @@ class Fronts:
             if part.with_corner:
                 tail = self.tail * block
                 f22[-tail:, -tail:] += handed.corner
-        for child, update in zip(self.tree.nodes[number].children, handed_on, strict=True):
-            self._extend_add(parts, own, self._runs[child], update)
-            self.memory.give_back(update)
+        with np.errstate(invalid="ignore", over="ignore"):  # what stands above the diagonals may be anything
+            for child, update in zip(self.tree.nodes[number].children, handed_on, strict=True):
+                self._extend_add(parts, own, self._runs[child], update)
+                self.memory.give_back(update)
         f11, f21, _ = parts
         if not own:
             return Factor(f11.T, f21.T), f22
         np.einsum("ii->i", f11)[:] += diagonal.reshape(-1)
-        root, failed = lapack.dpotrf(f11.T, lower=0, clean=0, overwrite_a=1)
+        root, failed = _potrf(f11.T, lower=0, clean=0, overwrite_a=1)
         if failed:
             raise NotPositive
-        across = blas.dtrsm(1.0, root, f21.T, lower=0, trans_a=1, overwrite_b=1)
-        blas.dsyrk(-1.0, across, beta=1.0, c=f22.T, trans=1, lower=0, overwrite_c=1)
+        across = _trsm(1.0, root, f21.T, lower=0, trans_a=1, overwrite_b=1)
+        _syrk(-1.0, across, beta=1.0, c=f22.T, trans=1, lower=0, overwrite_c=1)
         return Factor(root, across), f22
 
     def put_back(
@@ -216,7 +220,7 @@ class Fronts:
         if not len(node.eliminated):
             return
         rest = np.concatenate([solution[node.boundary].reshape(-1), tail])
-        own = blas.dtrsv(factor.root, factor.across @ rest, lower=0)
+        own = _trsv(factor.root, factor.across @ rest, lower=0)
         solution[node.eliminated] = -own.reshape(-1, self.block)
 
     def forget(self, factor: Factor) -> None:

@@ -91,17 +91,20 @@ def put_back(
     system: System,
     unknowns: Unknowns,
     model: Linearisation,
-    solution: ReducedVector,
+    images: Float[Array, "images block"],
+    border: Float[Array, " border"],
     step: Step,
     damping: Float[Array, ""],
     bend: Float[Array, ""],
 ) -> tuple[Unknowns, Sums]:
     """Return the tile's unknowns after a step, points refined, and its part of the sums.
 
-    - `solution`: of images and border. `step`: the same as a step within the bounds; its points are not read.
+    - `images`, `border`: the solution of the reduced system. `step`: the same as a step within the bounds; its points
+      are not read.
     """
     damped, of_points = damped_points(model, damping)
     points = eliminate(damped, of_points + (1 - system.free.points))
+    solution = ReducedVector(images, border)
     whole = back_substitute(system, points, jax.tree.map(jnp.negative, model.gradient), solution)
     step = eqx.tree_at(lambda s: s.points, step, whole.points)
     moved = eqx.tree_at(lambda u: u.points, unknowns.retract(step), move_points(system, unknowns, step.points))

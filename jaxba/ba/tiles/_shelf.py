@@ -70,7 +70,7 @@ class Shelf:
             for path, leaf in zip(paths, leaves, strict=True):
                 np.save(path, leaf)
         except OSError as error:
-            size, free = sum(leaf.nbytes for leaf in leaves), shutil.disk_usage(folder).free
+            size, free = float(sum(leaf.nbytes for leaf in leaves)), float(shutil.disk_usage(folder).free)
             raise JaxbaError(
                 f"{folder}: {size_text(size)} of a tile could not be written ({error.strerror}); {size_text(free)} are "
                 "free there. Make room, give a folder on another disk, or more memory (max_memory)."

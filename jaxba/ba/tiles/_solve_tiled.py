@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -69,7 +70,8 @@ def solve_tiled(
     solver = SchurLevenbergMarquardt(rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
     require_number("solve_tiled: max_observations", max_observations, 1.0, np.inf, "give a number of observations")
     require_number("solve_tiled: num_tiles", num_tiles, 1.0, 2.0**31 - 1, "give a whole number, 1 or more", whole=True)
-    workers = (os.cpu_count() or 1) if workers is None else workers
+    cores = os.cpu_count() or 1
+    workers = cores if workers is None else workers
     require_number("solve_tiled: workers", workers, 1.0, 1024.0, "give a whole number, 1 or more", whole=True)
     limit = memory_limit(max_memory)
 
@@ -79,7 +81,7 @@ def solve_tiled(
     shape = bare_shape(near)
     with (
         jax.enable_x64(True),
-        threadpool_limits(workers, user_api="blas"),
+        threadpool_limits(cores, user_api="blas"),  # sums depend on how many, so it is not the number of workers
         tempfile.TemporaryDirectory(prefix="jaxba-", dir=folder) as files,
     ):
         tree = dissect(
@@ -91,10 +93,10 @@ def solve_tiled(
         engine = Engine(near, loss, tree, fronts, budget, Path(files), int(workers))
         start = own_unknowns(near)
         set_up = time.perf_counter()
-        engine.compile()
+        engine.compile(start)
         compiled = time.perf_counter()
         costs = engine.costs(start)
-        state = jax.device_get(solver.state_of(np.asarray(costs[0])))
+        state = solver.state_of(jnp.asarray(costs[0]))
         found, state, history, interrupted = walk(
             start, state, lambda unknowns, state: engine.step(solver, unknowns, state), max_nfev, callback
         )

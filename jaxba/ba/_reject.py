@@ -6,6 +6,7 @@ left out comes back if it fits after all.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -39,8 +40,17 @@ class Rejected:
         return self.solutions[-1]
 
 
-def solve_and_reject(problem: Problem, *, rounds: int = 2, mad_factor: float = 2.5, **options: Any) -> Rejected:
-    """Solve, then `rounds` times reject by the MAD rule and solve again from there; `options` are those of `solve`.
+def solve_and_reject(
+    problem: Problem,
+    *,
+    rounds: int = 2,
+    mad_factor: float = 2.5,
+    solver: Callable[..., Solution] = solve,
+    **options: Any,
+) -> Rejected:
+    """Solve, then `rounds` times reject by the MAD rule and solve again from there.
+
+    - `solver`: `solve` or `solve_tiled`, to which the `options` belong.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(8, outlier_fraction=0.05)
@@ -51,7 +61,7 @@ def solve_and_reject(problem: Problem, *, rounds: int = 2, mad_factor: float = 2
     require_number("solve_and_reject: rounds", rounds, 0.0, 2.0**31 - 1, "give a whole number, 0 or more", whole=True)
     require_mad_factor(mad_factor)
     used = np.ones(problem.num_observations, bool)
-    solution, used = _solve_with(problem, used, options)
+    solution, used = _solve_with(problem, used, solver, options)
     found = quality(solution.apply(problem), used, mad_factor=mad_factor)
     num_rejected, solutions = [], [solution]
     for _ in range(int(rounds)):
@@ -59,14 +69,14 @@ def solve_and_reject(problem: Problem, *, rounds: int = 2, mad_factor: float = 2
         if np.array_equal(fits, used) or solution.result == "interrupted":
             break
         num_rejected.append(int(np.count_nonzero(~fits)))
-        solution, used = _solve_with(solution.apply(problem), fits, options)
+        solution, used = _solve_with(solution.apply(problem), fits, solver, options)
         solutions.append(solution)
         found = quality(solution.apply(problem), used, mad_factor=mad_factor)
     return Rejected(tuple(solutions), used, found, tuple(num_rejected))
 
 
 def _solve_with(
-    problem: Problem, used: Bool[np.ndarray, " observations"], options: dict[str, Any]
+    problem: Problem, used: Bool[np.ndarray, " observations"], solver: Callable[..., Solution], options: dict[str, Any]
 ) -> tuple[Solution, Bool[np.ndarray, " observations"]]:
     """Solve with some of the observations; return the solution and which of them the solve itself kept."""
     seen = problem.observations
@@ -76,7 +86,7 @@ def _solve_with(
         np.asarray(seen.image_index)[used],
         np.asarray(seen.point_index)[used],
     )
-    solution = solve(eqx.tree_at(lambda p: p.observations, problem, subset), **options)
+    solution = solver(eqx.tree_at(lambda p: p.observations, problem, subset), **options)
     kept = used.copy()
     if solution.report is not None:
         kept[used] = ~solution.report.dropped.observations

@@ -46,6 +46,17 @@ class SolveOptions:
     linear_solver: Annotated[
         Literal["auto", "dense", "banded", "cg"], Parameter(help="How the reduced system is solved.")
     ] = "auto"
+    tiled: Annotated[
+        bool,
+        Parameter(negative="", show_default=False, help="Tile by tile: the same solution, for blocks of any size."),
+    ] = False
+    max_memory: Annotated[
+        str | None,
+        Parameter(
+            help="With --tiled: memory that this may take, such as 4GB, or a share of the machine's; what does not fit "
+            "lies in files meanwhile. [default: 80% of what is free]"
+        ),
+    ] = None
     max_nfev: Annotated[int, Parameter(help="The most steps tried.")] = 500
     ftol: Annotated[float, Parameter(help="Stop when the cost changes by less than this share.")] = 1e-8
     xtol: Annotated[float, Parameter(help="Stop when the unknowns change by less than this share.")] = 1e-8

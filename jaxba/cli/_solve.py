@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import HistoryStep, Problem, Rejected, solve_and_reject
+from jaxba.ba import HistoryStep, Problem, Rejected, solve_and_reject, solve_tiled
 from jaxba.cli import _progress
 from jaxba.cli._options import INTERRUPTED, NOT_CONVERGED, SolveOptions
 from jaxba.cli._result import Run, facts, summary
@@ -29,7 +29,7 @@ from jaxba.io import (
     write_tile,
 )
 
-_ROUNDS = 2
+_ROUNDS, _TILE = 2, "tile.npz"
 _FILE_ENDINGS = (".bz2", ".txt", ".npz")
 _BAL_ENDINGS = (".txt", ".txt.bz2")
 _KINDS = ("intrinsics", "poses", "points")
@@ -39,6 +39,7 @@ def run(file: Path, options: SolveOptions) -> int:
     """Adjust the problem in a file, write the result, print it; return the exit code."""
     loss, bounds = make_loss(options), parse_bounds(options.bounds)
     _check_numbers(options)
+    file = tile_of(file)
     out = options.out or default_output(file)
     refuse_same_file(file, out)
     given = read_problem(file)
@@ -58,6 +59,21 @@ def run(file: Path, options: SolveOptions) -> int:
         print(f"jaxba: interrupted; {out} holds the values reached so far.", file=sys.stderr)
         return INTERRUPTED
     return 0 if found.solution.converged else NOT_CONVERGED
+
+
+def tile_of(file: Path) -> Path:
+    """Return the file itself, or the tile in the export of the project that it is.
+
+    Raises `JaxbaError` for a folder that is no project, and for a project without an export.
+    """
+    if not file.is_dir():
+        return file
+    if not is_project(file):
+        raise JaxbaError(f"{file}: a folder, and not that of a project; name a tile.npz or a BAL file.")
+    tile = file / EXPORT / _TILE
+    if not tile.is_file():
+        raise JaxbaError(f"{file}: the project has no {EXPORT}/{_TILE} yet; let jaxba run finish first.")
+    return tile
 
 
 def make_loss(options: SolveOptions) -> AbstractLoss:
@@ -143,6 +159,11 @@ def _check_numbers(options: SolveOptions) -> None:
             raise JaxbaError(f"--{name} {value:g}: give 0 (never stop for it) or a small positive number.")
     if not 0 < options.mad_factor < math.inf:
         raise JaxbaError(f"--mad-factor {options.mad_factor:g}: give a positive number, such as 2.5.")
+    if options.max_memory is not None and not options.tiled:
+        raise JaxbaError(f"--max-memory {options.max_memory}: only a solve in tiles keeps to a limit. Add --tiled.")
+    if options.tiled and (options.method != "lm" or options.linear_solver != "auto"):
+        given = f"--method {options.method}" if options.method != "lm" else f"--linear-solver {options.linear_solver}"
+        raise JaxbaError(f"{given}: --tiled solves by Levenberg-Marquardt on its own tree alone; leave it out.")
     if options.rounds is not None and options.reject is None:
         raise JaxbaError(f"--rounds {options.rounds}: rounds of what? Add --reject mad.")
     if options.rounds is not None and options.rounds < 0:
@@ -168,14 +189,16 @@ def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Reje
             callback = stack.enter_context(_progress.line())
         settings = {
             "loss": loss,
-            "method": options.method,
-            "linear_solver": options.linear_solver,
             "max_nfev": options.max_nfev,
             "ftol": options.ftol,
             "xtol": options.xtol,
             "gtol": options.gtol,
             "callback": callback,
         }
+        if options.tiled:
+            settings |= {"solver": solve_tiled, "max_memory": options.max_memory}
+        else:
+            settings |= {"method": options.method, "linear_solver": options.linear_solver}
         asked = _ROUNDS if options.rounds is None else options.rounds
         rounds = asked if options.reject else 0
         return solve_and_reject(problem, rounds=rounds, mad_factor=options.mad_factor, **settings)

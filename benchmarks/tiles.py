@@ -1,7 +1,7 @@
 """Blocks in tiles beside blocks in one piece: `python -m benchmarks.tiles`.
 
 Synthetic blocks (80% forward, 70% side overlap, one camera) are solved in processes of their own, so that the peak of
-memory is that of the solve: tile by tile in all memory, tile by tile under a limit, and in one piece by the band. Prints
+memory is that of the solve: tile by tile in all memory, tile by tile under a limit, in one piece by the band. Prints
 seconds a step (medians over all steps but the first), the peak of memory, and how seconds grow with images.
 
 `--sizes`: images of the blocks. `--limited`: which of them are solved under `--max-memory` as well. `--whole`: which of
@@ -25,7 +25,7 @@ import jaxba
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 4000, 16000])
+    parser.add_argument("--sizes", type=int, nargs="*", default=[1000, 4000, 16000])
     parser.add_argument("--limited", type=int, nargs="*", default=[16000])
     parser.add_argument("--whole", type=int, nargs="*", default=[1000, 4000])
     parser.add_argument("--max-memory", default="4GB")

@@ -29,6 +29,7 @@ from .ba import (
     residuals as residuals,
     solve as solve,
     solve_and_reject as solve_and_reject,
+    solve_batch as solve_batch,
     solve_tiled as solve_tiled,
     tune as tune,
 )

@@ -24,7 +24,7 @@ from jaxba.ba.groups import (
     LeverArmPrior,
     PositionPrior,
 )
-from jaxba.ba.tiles import solve_tiled
+from jaxba.ba.tiles import solve_batch, solve_tiled
 
 __all__ = [
     "PRIORS",
@@ -70,6 +70,7 @@ __all__ = [
     "residuals",
     "solve",
     "solve_and_reject",
+    "solve_batch",
     "solve_tiled",
     "tune",
 ]

@@ -16,6 +16,8 @@ import jax
 from jax import Array
 from jaxtyping import Float
 
+from jaxba._errors import JaxbaError
+from jaxba._sizes import free_memory, size_text
 from jaxba.ba._compiler import compiler_options
 from jaxba.ba._linearise import cost
 from jaxba.ba._solution import HistoryStep
@@ -53,6 +55,7 @@ def descend(
     begun = time.perf_counter()
     plain: System = jax.device_put(without_losses(system))
     run = compiled(solver, start, system, plain)
+    _require_memory(run.step)
     compiled_at = time.perf_counter()
 
     def step(unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
@@ -61,6 +64,18 @@ def descend(
     walked = walk(start, run.init(start, system), step, max_nfev, callback)
     seconds = compiled_at - begun, time.perf_counter() - compiled_at
     return Reached(*walked, functools.partial(run.cost, plain), *seconds)
+
+
+def _require_memory(step: jax.stages.Compiled) -> None:
+    """Raise `JaxbaError` where a step needs more memory than is free, in place of XLA's own error."""
+    found = step.memory_analysis()
+    need = float(found.temp_size_in_bytes + found.output_size_in_bytes) if found is not None else 0.0
+    if jax.default_backend() == "cpu" and need > free_memory():
+        raise JaxbaError(
+            f"solve: a step needs {size_text(need)} of memory, and {size_text(free_memory())} are free. Solve in "
+            "tiles: jaxba.solve_tiled(problem, max_memory=...), or --tiled on the command line, takes the same steps "
+            "in less."
+        )
 
 
 def walk(

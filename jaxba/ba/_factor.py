@@ -23,7 +23,8 @@ from jaxba.ba._schur import Reduced, ReducedVector
 from jaxba.ba._system import System
 
 _CG_TOLERANCE = 1e-8
-_CG_MAX_STEPS = 500
+CG_MAX_STEPS = 500
+"""Iterations after which conjugate gradients give up."""
 
 
 class Solved(NamedTuple):
@@ -297,7 +298,7 @@ def _solve_cg(
     state = (jnp.zeros_like(rhs), rhs, first, start, jnp.array(0))
 
     def going(state: tuple[Array, ...]) -> Array:
-        return jnp.any(state[3] > start * _CG_TOLERANCE**2) & (state[4] < _CG_MAX_STEPS)
+        return jnp.any(state[3] > start * _CG_TOLERANCE**2) & (state[4] < CG_MAX_STEPS)
 
     x, _, _, _, count = lax.while_loop(going, step, state)
     return x, count

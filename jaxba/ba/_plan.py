@@ -17,6 +17,7 @@ Cost: O(observations log observations + pairs log pairs); 0.1 s for 500 images, 
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -28,7 +29,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._problem import Problem
+from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._projection import camera_centers
 from jaxba.geometry import require_number
 
@@ -65,6 +66,8 @@ class PlanShape:
     linear_solver: Literal["dense", "banded", "cg"]
     panel_images: int
     band_panels: int
+    prior_rows: tuple[int, ...]
+    """Rows of each prior."""
 
     @property
     def num_refined(self) -> int:
@@ -89,7 +92,7 @@ class PlanShape:
 _NOTHING = PlanShape(
     num_images=0, num_points=0, num_rows=0, chunk_runs=0, num_cameras=0, refined=(), own_cameras=False, lever_arm=False,
     any_fixed_pose=False, any_fixed_point=False, any_bound=False, num_pair_runs=0, num_blocks=0, linear_solver="dense",
-    panel_images=1, band_panels=0,
+    panel_images=1, band_panels=0, prior_rows=(),
 )  # fmt: skip
 
 
@@ -211,6 +214,9 @@ def bare_shape(problem: Problem, like: PlanShape | None = None) -> PlanShape:
     least = _NOTHING if like is None else like
     free = problem.free
     refined = np.atleast_1d(np.asarray(free.intrinsics).any(axis=0))
+    rows = [bucket(num_rows(prior)) for prior in problem.priors]
+    if len(rows) == len(least.prior_rows):
+        rows = [max(own, of_like) for own, of_like in zip(rows, least.prior_rows, strict=True)]
     several = problem.num_cameras > 1 or least.own_cameras
     own_cameras = _own_cameras(problem) and several and not _any_bound(problem)
     if least.own_cameras == own_cameras and len(least.refined) == len(refined):
@@ -224,7 +230,32 @@ def bare_shape(problem: Problem, like: PlanShape | None = None) -> PlanShape:
         any_fixed_pose=not np.asarray(free.poses).all() or least.any_fixed_pose,
         any_fixed_point=not np.asarray(free.points).all() or least.any_fixed_point,
         any_bound=_any_bound(problem),
+        prior_rows=tuple(rows),
     )
+
+
+def larger(first: PlanShape, second: PlanShape) -> PlanShape:
+    """Return the larger of every size of two shapes of the same kind."""
+    names = ("num_images", "num_points", "num_rows", "num_cameras", "num_pair_runs", "num_blocks", "band_panels")
+    sizes = {name: max(getattr(first, name), getattr(second, name)) for name in names}
+    rows = tuple(max(rows) for rows in zip(first.prior_rows, second.prior_rows, strict=True))
+    flags = {name: getattr(first, name) or getattr(second, name) for name in ("any_fixed_pose", "any_fixed_point")}
+    return dataclasses.replace(second, **sizes, **flags, prior_rows=rows)
+
+
+def alike(sizes: Sequence[int], least: float) -> list[list[int]]:
+    """Return the indices of sizes in groups, the largest first, in which none is below `least` of the largest."""
+    groups: list[list[int]] = []
+    for number in sorted(range(len(sizes)), key=lambda k: -sizes[k]):
+        if not groups or sizes[number] < least * sizes[groups[-1][0]]:
+            groups.append([])
+        groups[-1].append(number)
+    return groups
+
+
+def num_rows(prior: AbstractPrior) -> int:
+    """Return the number of a prior's rows."""
+    return next(np.shape(value)[0] for name, value in vars(prior).items() if name != "loss")
 
 
 def bucket(count: int, *, multiple: int = 1) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxba.ba._factor import CG_MAX_STEPS
 from jaxba.ba._problem import Problem
 from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
 from jaxba.ba._unknowns import Unknowns
@@ -40,6 +41,8 @@ _ADVICE = {
     "gtol ask for more digits than there are.",
     "not_finite": "Not started: the cost at the start values is not finite. Some point may lie in a camera's plane.",
     "interrupted": "Interrupted: these are the values reached so far.",
+    "cg_unconverged": "Not converged: conjugate gradients gave up before they found the last step, whose length says "
+    "nothing then. Solve in tiles (jaxba.solve_tiled, or --tiled), where steps are exact at any size.",
 }
 
 
@@ -134,13 +137,15 @@ class Solution(eqx.Module):
 
     @property
     def result(self) -> str:
-        """One of ftol, xtol, gtol, rounding (converged), max_nfev, stuck, not_finite, interrupted.
+        """One of ftol, xtol, gtol, rounding (converged), max_nfev, stuck, not_finite, interrupted, cg_unconverged.
 
-        A solve inside `jit`, `vmap` or a derivative does not tell `rounding` from `stuck`.
+        A solve inside `jit`, `vmap` or a derivative does not tell `rounding` from `stuck`, nor `cg_unconverged`.
         """
         if self.report is not None and self.report.interrupted:
             return "interrupted"
         result = RESULTS[int(self.status)]
+        if result != "gtol" and self.report is not None and self.report.history[-1].linear_iterations >= CG_MAX_STEPS:
+            return "cg_unconverged"
         return "rounding" if result == "stuck" and self._is_at_rounding() else result
 
     @property

@@ -33,10 +33,11 @@ from jaxba.ba._system import (
 )
 from jaxba.ba._traced import solve_traced
 from jaxba.ba._unknowns import Unknowns
+from jaxba.ba.checks import Prepared
 from jaxba.geometry import AbstractLoss, Linear, check_loss, require_number
 
 Method = Literal["lm", "dogleg"]
-_SOLVERS: dict[str, type[SchurLevenbergMarquardt] | type[SchurDogleg]] = {
+SOLVERS: dict[str, type[SchurLevenbergMarquardt] | type[SchurDogleg]] = {
     "lm": SchurLevenbergMarquardt,
     "dogleg": SchurDogleg,
 }
@@ -85,7 +86,7 @@ def solve(
     loss = Linear() if loss is None else loss
     check_loss("solve: loss", loss)
     for name, value, choices in (
-        ("method", method, tuple(_SOLVERS)),
+        ("method", method, tuple(SOLVERS)),
         ("linear_solver", linear_solver, get_args(LinearSolver)),
         ("adjoint", adjoint, get_args(Adjoint)),
         ("dtype", _name_of(dtype), ("float64", "float32")),
@@ -93,7 +94,7 @@ def solve(
         if value not in choices:
             raise JaxbaError(f"solve: {name} {value!r}: choose one of {', '.join(choices)}.")
     max_nfev = require_stops("solve", max_nfev=max_nfev, ftol=ftol, xtol=xtol, gtol=gtol)
-    solver = _SOLVERS[method](rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
+    solver = SOLVERS[method](rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
     if is_traced((problem, loss)):
         return solve_traced(problem, loss, solver, plan, linear_solver, adjoint, max_nfev, callback)
     # OpenBLAS's threads fight with XLA's for the cores (with them a 144 x 144 Cholesky took 204 ms instead of 0.16 ms),
@@ -132,6 +133,23 @@ def _solve_on_host(
 ) -> Solution:
     begun = time.perf_counter()
     prepared, plan = structured(problem, plan, linear_solver)
+    return solve_prepared(prepared, plan, loss, solver, max_nfev, dtype, callback, begun)
+
+
+def solve_prepared(
+    prepared: Prepared,
+    plan: Plan,
+    loss: AbstractLoss,
+    solver: AbstractSchurSolver,
+    max_nfev: int,
+    dtype: Any,
+    callback: Callable[[HistoryStep], None] | None,
+    begun: float,
+) -> Solution:
+    """Return the solution of a problem that was checked, in double precision and with one thread of BLAS as `solve`.
+
+    - `begun`: when its checks began, by `time.perf_counter`.
+    """
     problem = prepared.problem
     near, origin = centred(problem)
     system: System = jax.device_put(make_system(near, plan, loss, dtype))

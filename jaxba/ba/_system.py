@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, PlanShape, bucket, make_plan
+from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, PlanShape, make_plan
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._projection import camera_centers
 from jaxba.ba._unknowns import Step, Unknowns
@@ -111,7 +111,7 @@ def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = n
     return System(
         reprojection=reprojection,
         loss=_as_arrays(xp, loss, dtype),
-        priors=tuple(_reordered(xp, prior, plan, dtype) for prior in problem.priors),
+        priors=tuple(_reordered(xp, *each, plan, dtype) for each in zip(problem.priors, shape.prior_rows, strict=True)),
         free=free,
         lower=_padded(xp, problem.lower, plan.camera_order, shape.num_cameras, -np.inf, dtype),
         upper=_padded(xp, problem.upper, plan.camera_order, shape.num_cameras, np.inf, dtype),
@@ -227,8 +227,8 @@ def _padded(xp: Any, values: Any, order: Array | np.ndarray, count: int, fill: f
     return xp.concatenate([ordered, tail]) if missing else ordered
 
 
-def _reordered(xp: Any, prior: AbstractPrior, plan: Plan, dtype: Any) -> AbstractPrior:
-    """Return a prior with its indices in the solver's order, padded to a bucket with rows of infinite sigma."""
+def _reordered(xp: Any, prior: AbstractPrior, rows: int, plan: Plan, dtype: Any) -> AbstractPrior:
+    """Return a prior with its indices in the solver's order, filled up with rows of infinite sigma."""
     ranks = {
         "image_index": xp.argsort(plan.image_order),
         "point_index": xp.argsort(plan.point_order),
@@ -243,7 +243,7 @@ def _reordered(xp: Any, prior: AbstractPrior, plan: Plan, dtype: Any) -> Abstrac
         indexed = field.name in ranks
         value = xp.asarray(ranks[field.name], np.int32)[value] if indexed else xp.asarray(value, dtype)
         count = value.shape[0]
-        fill = np.inf if field.name.startswith("std") else None
+        fill = np.inf if field.name.startswith("std") else None if count else 0.0 if indexed else 1.0
         of = np.int32 if indexed else dtype
-        changed[field.name] = _padded(xp, value, np.arange(count), bucket(count), fill, of)
+        changed[field.name] = _padded(xp, value, np.arange(count), rows, fill, of)
     return dataclasses.replace(prior, **changed)

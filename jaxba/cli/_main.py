@@ -28,6 +28,7 @@ app = App(
 )
 
 _File = Annotated[Path, Parameter(help="A tile.npz, or a BAL problem, text or bz2.")]
+_Problem = Annotated[Path, Parameter(help="A tile.npz, a BAL problem, text or bz2, or a project: its exported tile.")]
 _Config = Annotated[
     Path | None, Parameter(help="Parameters in TOML, a table a stage. [default: jaxba.toml in the working folder]")
 ]
@@ -60,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 @app.command(help=f"Adjust a problem, print a summary, write the adjusted tile.\n\n{_EXIT_CODES}")
 def solve(
-    file: _File,
+    file: _Problem,
     /,
     *,
     options: Annotated[SolveOptions | None, Parameter(name="*")] = None,

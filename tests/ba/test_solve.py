@@ -143,6 +143,24 @@ def test_evaluation_limit_is_not_convergence() -> None:
     assert not solution.converged
 
 
+def test_conjugate_gradients_that_give_up_are_not_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
+    # breaks where a short step of an unfinished linear solve passes for the optimum
+    problem = jaxba.synthetic.uav_block(8, points_per_image=30.0).problem
+    done = jaxba.solve(problem, linear_solver="cg")
+    assert done.converged and max(step.linear_iterations for step in done.report.history) < 500
+    for module in ("_factor", "_solution"):
+        monkeypatch.setattr(f"jaxba.ba.{module}.CG_MAX_STEPS", 2)
+    given_up = jaxba.solve(problem, linear_solver="cg", ftol=1e-3)  # another tolerance is another program
+    assert given_up.result == "cg_unconverged" and not given_up.converged
+    assert "Solve in tiles" in given_up.advice
+
+
+def test_too_little_memory_is_told_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jaxba.ba._descend.free_memory", lambda: 1e4)
+    with pytest.raises(jaxba.JaxbaError, match=r"a step needs .* of memory, and 10.0 kB are free. .*max_memory"):
+        jaxba.solve(PROBLEM, loss=LOSS)
+
+
 def test_point_behind_the_camera_is_left_out_and_named() -> None:
     points = PROBLEM.points.copy()
     points[3, 2] = 1e4  # far above the flight

@@ -14,17 +14,18 @@ from jaxba.geometry import AbstractLoss, Linear
 
 
 class LeverArmPrior(AbstractPrior):
-    """Measured lever arm: `xyz` metres in the camera's frame, `std_m` a sigma an axis; one row."""
+    """Measured lever arm: `xyz` metres in the camera's frame, `std_m` a sigma an axis; one row, or none."""
 
     name: ClassVar[str] = "lever_arm"
     in_world: ClassVar[tuple[str, ...] | None] = ()
-    xyz: Float[Array | np.ndarray, "1 3"]
-    std_m: Float[Array | np.ndarray, "1 3"]
+    xyz: Float[Array | np.ndarray, "rows 3"]
+    std_m: Float[Array | np.ndarray, "rows 3"]
     loss: AbstractLoss = Linear()
 
-    def residual(self, unknowns: Unknowns) -> Float[Array, "3 1"]:
+    def residual(self, unknowns: Unknowns) -> Float[Array, "3 rows"]:
         return ((jnp.asarray(unknowns.lever_arm)[None] - self.xyz) / jnp.asarray(self.std_m)).T
 
     def rows(self, unknowns: Unknowns) -> Rows:
-        derivative = jnp.eye(3, dtype=unknowns.lever_arm.dtype) / jnp.asarray(self.std_m).T
-        return Rows(residual=self.residual(unknowns), lever_arm=derivative[:, :, None])
+        identity = jnp.eye(3, dtype=unknowns.lever_arm.dtype)
+        derivative = identity[:, :, None] / jnp.asarray(self.std_m).T[:, None]
+        return Rows(residual=self.residual(unknowns), lever_arm=derivative)

@@ -1,5 +1,6 @@
-"""Tiles: a block cut into parts, its exact adjustment part by part in bounded memory."""
+"""Tiles: many problems at once, and one block cut into parts: exact adjustment part by part in bounded memory."""
 
+from jaxba.ba.tiles._batch import solve_batch
 from jaxba.ba.tiles._solve_tiled import solve_tiled
 
-__all__ = ["solve_tiled"]
+__all__ = ["solve_batch", "solve_tiled"]

@@ -5,14 +5,14 @@ the others to the first tile. Tiles of like sizes get like shapes, so that they 
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.ba._plan import Plan, PlanShape, bare_shape, make_plan
+from jaxba.ba._plan import Plan, PlanShape, alike, bare_shape, larger, make_plan, num_rows
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._system import System, arrange, make_system, restore
 from jaxba.ba._unknowns import Unknowns
@@ -56,7 +56,7 @@ class Tile:
 
 def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int, Tile, System]]:
     """Return the tiles with their systems, the largest ones first, each with its number."""
-    shape = bare_shape(problem)
+    shape = dataclasses.replace(bare_shape(problem), prior_rows=())  # a tile has some of the rows
     seen = problem.observations
     tile_of_row = tree.tile_of_point[np.asarray(seen.point_index)]
     rows_of_tile = np.split(np.argsort(tile_of_row, kind="stable"), np.cumsum(np.bincount(tile_of_row))[:-1])
@@ -65,41 +65,22 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
         owner[np.asarray(seen.image_index)[rows_of_tile[number]]] = number
     unseen = np.bincount(np.asarray(seen.image_index), minlength=problem.num_images) == 0
     tile_of_prior = [_tile_of_rows(prior, owner, tree.tile_of_point) for prior in problem.priors]
-    most_rows = [int(np.bincount(tiles, minlength=1).max(initial=1)) for tiles in tile_of_prior]
 
     def part(number: int, like: PlanShape) -> tuple[Problem, Tile]:
         rows = rows_of_tile[number]
         images = np.unique(np.append(np.asarray(seen.image_index)[rows], np.flatnonzero(unseen & (number == 0))))
         points = np.flatnonzero(tree.tile_of_point == number)
         chosen = [np.flatnonzero(tiles == number) for tiles in tile_of_prior]
-        found, cameras = _part(problem, rows, images, points, chosen, most_rows, own_cameras=shape.own_cameras)
+        found, cameras = _part(problem, rows, images, points, chosen, own_cameras=shape.own_cameras)
         order = np.argsort(tree.rank[images]).astype(np.int32)
         plan = make_plan(found, linear_solver="dense", like=like, image_order=order)
         return found, Tile(images, cameras, points, images[order], plan)
 
-    for group in _alike([len(rows) for rows in rows_of_tile]):
-        like = shape
-        for number in group:
-            like = _larger(like, part(number, shape)[1].plan.shape)
+    for group in alike([len(rows) for rows in rows_of_tile], _LIKE):
+        like = functools.reduce(larger, (part(number, shape)[1].plan.shape for number in group))
         for number in group:
             found, tile = part(number, like)
             yield number, tile, make_system(found, tile.plan, loss)
-
-
-def _alike(sizes: list[int]) -> list[list[int]]:
-    """Return the tiles in groups that are to share a shape, the largest ones first."""
-    groups: list[list[int]] = []
-    for number in sorted(range(len(sizes)), key=lambda k: -sizes[k]):
-        if not groups or sizes[number] < _LIKE * sizes[groups[-1][0]]:
-            groups.append([])
-        groups[-1].append(number)
-    return groups
-
-
-def _larger(first: PlanShape, second: PlanShape) -> PlanShape:
-    """Return the larger of every size of two shapes of the same kind."""
-    names = ("num_images", "num_points", "num_rows", "num_cameras", "num_pair_runs", "num_blocks")
-    return dataclasses.replace(second, **{name: max(getattr(first, name), getattr(second, name)) for name in names})
 
 
 def _tile_of_rows(
@@ -108,11 +89,7 @@ def _tile_of_rows(
     for name, tiles in (("image_index", owner), ("point_index", tile_of_point)):
         if hasattr(prior, name):
             return tiles[np.asarray(getattr(prior, name))]
-    return np.zeros(_num_rows(prior), np.int32)
-
-
-def _num_rows(prior: AbstractPrior) -> int:
-    return next(np.shape(leaf)[0] for name, leaf in vars(prior).items() if name != "loss")
+    return np.zeros(num_rows(prior), np.int32)
 
 
 def _part(
@@ -121,7 +98,6 @@ def _part(
     images: Int[np.ndarray, " images"],
     points: Int[np.ndarray, " points"],
     chosen: list[Int[np.ndarray, " _"]],
-    most_rows: list[int],
     *,
     own_cameras: bool,
 ) -> tuple[Problem, Int[np.ndarray, " cameras"]]:
@@ -141,19 +117,12 @@ def _part(
         "camera_index": place(cameras, problem.num_cameras),
     }
 
-    def taken(prior: AbstractPrior, rows: Int[np.ndarray, " rows"], most: int) -> AbstractPrior:
-        """Its rows, filled up with ones of infinite sigma."""
-        fields: dict[str, Any] = {}
-        for name, value in vars(prior).items():
-            if name == "loss" or not np.shape(value)[0]:
-                continue
-            given = np.asarray(value)
-            filled = np.broadcast_to(given[:1], (most, *given.shape[1:])).copy()
-            if name.startswith("std"):
-                filled[:] = np.inf
-            filled[: len(rows)] = given[rows]
-            fields[name] = places[name][filled] if name in places else filled
-        return dataclasses.replace(prior, **fields)
+    def taken(prior: AbstractPrior, rows: Int[np.ndarray, " rows"]) -> AbstractPrior:
+        """Return the prior with these rows alone."""
+        fields = {name: np.asarray(value)[rows] for name, value in vars(prior).items() if name != "loss"}
+        return dataclasses.replace(
+            prior, **{name: places[name][value] if name in places else value for name, value in fields.items()}
+        )
 
     of_observations = Observations(
         np.asarray(seen.xy_px)[rows],
@@ -167,7 +136,7 @@ def _part(
         camera_index=places["camera_index"][camera_index[images]],
         points=np.asarray(problem.points)[points],
         observations=of_observations,
-        priors=tuple(taken(*each) for each in zip(problem.priors, chosen, most_rows, strict=True)),
+        priors=tuple(taken(*each) for each in zip(problem.priors, chosen, strict=True)),
         lever_arm=np.asarray(problem.lever_arm),
         free=Free(
             np.asarray(free.poses)[images],

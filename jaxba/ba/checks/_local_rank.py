@@ -30,6 +30,7 @@ from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.checks._connected_parts import hat
 from jaxba.ba.checks._gauge import prior_rows
+from jaxba.geometry import AbstractCamera
 
 _NULL = 1e-12  # eigenvalue over the largest, as for the gauge
 _FEW_IMAGES, _FEW_ROWS = 8, 40  # of each camera that are looked at first: images, observations of each
@@ -192,30 +193,36 @@ def _rows(
     of_row = np.repeat(camera, shape[1])
     values = np.stack([np.asarray(getattr(problem.cameras, name), float) for name in names], axis=-1)
 
-    def pixels(values: Float[np.ndarray, "cameras parameters"], flat: Float[np.ndarray, "3 m"]) -> np.ndarray:
-        return project_in_cameras(type(problem.cameras)(*values.T), of_row, flat)
-
     step = _STEP * np.linalg.norm(flat, axis=0)
-    by_point = []
-    for axis in np.eye(3):
-        moved = axis[:, None] * step
-        by_point.append((pixels(values, flat + moved) - pixels(values, flat - moved)) / (2 * step))
-    a = np.moveaxis(np.stack(by_point), 2, 0)  # rows, xyz, uv
+    changes = np.eye(len(names))[:, None] * 1e-3 * np.maximum(np.abs(values), 1.0)
+    moved = [(values, flat + sign * axis[:, None] * step) for axis in np.eye(3) for sign in (1, -1)]
+    changed = [(values + sign * change, flat) for change in changes for sign in (1, -1)]
+    pixels = _project_all([*moved, *changed], type(problem.cameras), of_row)
+    differences = pixels[0::2] - pixels[1::2]
+    by_point = differences[:3] / (2 * step)
+    by_intrinsics = differences[3:] / (2 * changes.max(axis=2)[:, None, of_row])
+    a = np.moveaxis(by_point, 2, 0)  # rows, xyz, uv
     turned = np.einsum("nik,nij->njk", a, -hat(flat.T))
     of_pose = np.concatenate([turned, a], axis=1)
-    by_intrinsics = []
-    for i in range(len(names)):
-        change = np.zeros_like(values)
-        change[:, i] = 1e-3 * np.maximum(np.abs(values[:, i]), 1.0)
-        difference = pixels(values + change, flat) - pixels(values - change, flat)
-        by_intrinsics.append(difference / (2 * change[of_row, i]))
-    of_intrinsics = np.moveaxis(np.stack(by_intrinsics), 2, 0)
+    of_intrinsics = np.moveaxis(by_intrinsics, 2, 0)
 
     def by_image(rows: Float[np.ndarray, "m columns 2"]) -> np.ndarray:
         rows = np.where(np.isfinite(rows), rows, 0.0)
         return np.swapaxes(rows, 1, 2).reshape(shape[0], 2 * shape[1], -1)
 
     return by_image(of_pose), by_image(of_intrinsics)
+
+
+def _project_all(
+    cases: list[tuple[Float[np.ndarray, "cameras parameters"], Float[np.ndarray, "3 rows"]]],
+    model: type[AbstractCamera],
+    of_row: Int[np.ndarray, " rows"],
+) -> Float[np.ndarray, "cases 2 rows"]:
+    """Return the pixels of every case, cameras and points, in one call: each costs more than its few rows."""
+    values = np.concatenate([values for values, _ in cases])
+    camera = (np.arange(len(cases))[:, None] * len(cases[0][0]) + of_row).reshape(-1)
+    pixels = project_in_cameras(model(*values.T), camera, np.concatenate([points for _, points in cases], axis=1))
+    return np.moveaxis(pixels.reshape(2, len(cases), -1), 0, 1)
 
 
 def _intrinsics_priors(

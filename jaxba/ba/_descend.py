@@ -27,6 +27,7 @@ from jaxba.ba._unknowns import Unknowns
 
 _KEPT = 32
 _SMALL = 3_000_000  # entries of all arrays
+_SURELY_FREE = 1e8  # bytes
 
 
 class Reached(NamedTuple):
@@ -55,7 +56,7 @@ def descend(
     begun = time.perf_counter()
     plain: System = jax.device_put(without_losses(system))
     run = compiled(solver, start, system, plain)
-    _require_memory(run.step)
+    _require_memory(run.step_bytes)
     compiled_at = time.perf_counter()
 
     def step(unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
@@ -66,15 +67,15 @@ def descend(
     return Reached(*walked, functools.partial(run.cost, plain), *seconds)
 
 
-def _require_memory(step: jax.stages.Compiled) -> None:
+def _require_memory(need: float) -> None:
     """Raise `JaxbaError` where a step needs more memory than is free, in place of XLA's own error."""
-    found = step.memory_analysis()
-    need = float(found.temp_size_in_bytes + found.output_size_in_bytes) if found is not None else 0.0
-    if jax.default_backend() == "cpu" and need > free_memory():
+    if need < _SURELY_FREE or jax.default_backend() != "cpu":
+        return
+    free = free_memory()
+    if need > free:
         raise JaxbaError(
-            f"solve: a step needs {size_text(need)} of memory, and {size_text(free_memory())} are free. Solve in "
-            "tiles: jaxba.solve_tiled(problem, max_memory=...), or --tiled on the command line, takes the same steps "
-            "in less."
+            f"solve: a step needs {size_text(need)} of memory, and {size_text(free)} are free. Solve in tiles: "
+            "jaxba.solve_tiled(problem, max_memory=...), or --tiled on the command line, takes the same steps in less."
         )
 
 
@@ -102,11 +103,15 @@ def walk(
 
 
 class Compiled(NamedTuple):
-    """Compiled functions: `init(unknowns, system)`, `step(unknowns, state, system)` and `cost(system, unknowns)`."""
+    """Compiled functions: `init(unknowns, system)`, `step(unknowns, state, system)` and `cost(system, unknowns)`.
+
+    - `step_bytes`: what a step takes beside its arguments.
+    """
 
     init: jax.stages.Compiled
     step: jax.stages.Compiled
     cost: jax.stages.Compiled
+    step_bytes: float
 
 
 def compiled(solver: AbstractSchurSolver, unknowns: Unknowns, system: System, plain: System) -> Compiled:
@@ -141,7 +146,9 @@ def _compile(solver: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tu
     options = compiler_options() if small else {}
     with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
         of_step, of_init, of_cost = pool.map(lambda one: one.compile(compiler_options=options), lowered)
-    return Compiled(init=of_init, step=of_step, cost=of_cost)
+    found = of_step.memory_analysis()
+    step_bytes = 0.0 if found is None else float(found.temp_size_in_bytes + found.output_size_in_bytes)
+    return Compiled(init=of_init, step=of_step, cost=of_cost, step_bytes=step_bytes)
 
 
 def _history_step(step: int, started: float, state: State) -> HistoryStep:

@@ -157,6 +157,7 @@ def test_conjugate_gradients_that_give_up_are_not_convergence(monkeypatch: pytes
 
 def test_too_little_memory_is_told_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jaxba.ba._descend.free_memory", lambda: 1e4)
+    monkeypatch.setattr("jaxba.ba._descend._SURELY_FREE", 1e4)
     with pytest.raises(jaxba.JaxbaError, match=r"a step needs .* of memory, and 10.0 kB are free. .*max_memory"):
         jaxba.solve(PROBLEM, loss=LOSS)
 

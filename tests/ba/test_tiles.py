@@ -36,8 +36,10 @@ def _everything() -> Problem:
 
 @functools.cache
 def _fixed() -> Problem:
-    """Three cameras, and poses, points and an intrinsic held fixed."""
-    return _BLOCK(num_cameras=3).problem.fix(poses=[0, 7, 33], points=[5, 9, 200], intrinsics=["p1"])
+    """Three cameras; poses, points and an intrinsic held fixed; an image that sees nothing."""
+    problem = _BLOCK(num_cameras=3).problem.fix(poses=[0, 7, 33], points=[5, 9, 200], intrinsics=["p1"])
+    kept = problem.observations.image_index != 12
+    return eqx.tree_at(lambda p: p.observations, problem, jax.tree.map(lambda of: of[kept], problem.observations))
 
 
 @functools.cache

@@ -1,7 +1,8 @@
 """Cut a problem into the tiles of a tree: each holds some points with all their observations and the images of these.
 
 Every row of every prior goes to one tile: those of a point to its own, those of an image to the first one that sees it,
-the others to the first tile. Tiles of like sizes get like shapes, so that they share what is compiled.
+the others to the first tile, as do images that see nothing. Tiles of like sizes get like shapes, so that they share
+what is compiled.
 """
 
 import dataclasses

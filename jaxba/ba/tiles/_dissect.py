@@ -88,9 +88,9 @@ class _Dissection:
     def tree(self, num_tiles: int) -> Tree:
         rows = np.argsort(self.image, kind="stable").astype(np.int32)
         self._node(rows, max(num_tiles, int(np.ceil(len(rows) / self.most))))
-        nothing = np.flatnonzero(self.count == 0)
-        root = self.nodes[-1]
-        self.nodes[-1] = dataclasses.replace(root, eliminated=np.concatenate([root.eliminated, nothing]))
+        first = self.tiles[0]  # which takes the images that see nothing
+        eliminated = np.concatenate([self.nodes[first].eliminated, np.flatnonzero(self.count == 0)])
+        self.nodes[first] = dataclasses.replace(self.nodes[first], eliminated=eliminated)
         order = np.concatenate([node.eliminated for node in self.nodes])
         rank = np.empty(len(order), np.int32)
         rank[order] = np.arange(len(order), dtype=np.int32)

@@ -219,7 +219,9 @@ class Engine:
         lower = upper = None
         if self.shape.any_bound:
             lower, upper = (
-                self._reduced(Step(self.free.poses, bound - unknowns.intrinsics, far, self.free.points))[1]
+                self._reduced(
+                    Step(self.free.poses, bound - unknowns.intrinsics, far, self.free.points), self.camera_index
+                )[1]
                 for bound, far in ((self.lower, np.full(3, -np.inf)), (self.upper, np.full(3, np.inf)))
             )
         return np.asarray(call_compiled(box_minimum, corner, top[count, :count], lower, upper))
@@ -298,17 +300,15 @@ class Engine:
         return Step(free.poses[:0], intrinsics, lever_arm, free.points)
 
     def _reduced(
-        self, step: Step, camera_index: Int[np.ndarray, " images"] | None = None
+        self, step: Step, camera_index: Int[np.ndarray, " images"]
     ) -> tuple[Float[np.ndarray, "images block"], Float[np.ndarray, " border"]]:
         """Return the images' and the border's part of a step, as `_schur.to_reduced` does."""
         shape = self.shape
         refined = step.intrinsics[:, np.flatnonzero(shape.refined)]
         lever_arm = np.asarray(step.lever_arm if shape.lever_arm else step.lever_arm[:0])
-        if shape.own_cameras and camera_index is not None:
+        if shape.own_cameras:
             return np.concatenate([step.poses, refined[camera_index]], axis=1), lever_arm
-        return np.asarray(step.poses), np.concatenate(
-            [refined.reshape(-1) if not shape.own_cameras else lever_arm[:0], lever_arm]
-        )
+        return np.asarray(step.poses), np.concatenate([refined.reshape(-1), lever_arm])
 
     def _damping(self, squares: Step, damping: Float[np.ndarray, ""], tile: Tile | None = None) -> Step:
         """Return what is added to the diagonal of images and border, of a tile's or of all."""

@@ -124,7 +124,7 @@ class Fronts:
     """
 
     def __init__(self, tree: Tree, block: int, border: int) -> None:
-        self.tree, self.block, self.border = tree, block, border
+        self.tree, self.block = tree, block
         self.tail = tail_size(block, border)
         self.ranks = [tree.rank[np.concatenate([node.eliminated, node.boundary])] for node in tree.nodes]
         self.own = [len(node.eliminated) for node in tree.nodes]
@@ -189,12 +189,9 @@ class Fronts:
         own_size, rest_size = own * block, rest * block
         f22 = self.memory.lower_zeros(rest_size)
         parts = self.memory.lower_zeros(own_size), self.memory.zeros(rest_size, own_size), f22
-        if part is not None and handed is not None:
-            self._add_blocks(parts, own, part, handed)
-            if part.with_corner:
-                tail = self.tail * block
-                f22[-tail:, -tail:] += handed.corner
         with np.errstate(invalid="ignore", over="ignore"):  # what stands above the diagonals may be anything
+            if part is not None and handed is not None:
+                self._add_blocks(parts, own, part, handed)
             for child, update in zip(self.tree.nodes[number].children, handed_on, strict=True):
                 self._extend_add(parts, own, self._runs[child], update)
                 self.memory.give_back(update)
@@ -275,6 +272,9 @@ class Fronts:
             below = f21 if target is f11 else f22
             for k in range(self.tail):
                 below[len(below) - self.tail + k, :, at] += blocks[:, k]
+        if part.with_corner:
+            size = self.tail * block
+            parts[2][-size:, -size:] += handed.corner
 
     def _extend_add(
         self, parts: tuple[np.ndarray, np.ndarray, np.ndarray], own: int, runs: list[_Run], update: np.ndarray

@@ -228,12 +228,13 @@ def _padded(xp: Any, values: Any, order: Array | np.ndarray, count: int, fill: f
 
 
 def _reordered(xp: Any, prior: AbstractPrior, rows: int, plan: Plan, dtype: Any) -> AbstractPrior:
-    """Return a prior with its indices in the solver's order, filled up with rows of infinite sigma."""
+    """Return a prior with its indices in the solver's order; if it has sigmas, filled up with rows of infinite ones."""
     ranks = {
         "image_index": xp.argsort(plan.image_order),
         "point_index": xp.argsort(plan.point_order),
         "camera_index": xp.argsort(plan.camera_order),
     }
+    has_sigmas = any(field.name.startswith("std") for field in dataclasses.fields(prior))
     changed: dict[str, Any] = {}
     for field in dataclasses.fields(prior):
         value = getattr(prior, field.name)
@@ -245,5 +246,5 @@ def _reordered(xp: Any, prior: AbstractPrior, rows: int, plan: Plan, dtype: Any)
         count = value.shape[0]
         fill = np.inf if field.name.startswith("std") else None if count else 0.0 if indexed else 1.0
         of = np.int32 if indexed else dtype
-        changed[field.name] = _padded(xp, value, np.arange(count), rows, fill, of)
+        changed[field.name] = _padded(xp, value, np.arange(count), rows if has_sigmas else count, fill, of)
     return dataclasses.replace(prior, **changed)

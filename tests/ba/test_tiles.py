@@ -4,14 +4,17 @@ import dataclasses
 import errno
 import functools
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxba
 from jaxba import JaxbaError, Problem, Solution
+from jaxba.ba import AbstractPrior, JacobianBlock, Rows, Unknowns
 from jaxba.ba.tiles import _shelf
 from jaxba.ba.tiles._budget import Budget
 from jaxba.ba.tiles._dissect import Tree, dissect
@@ -208,6 +211,32 @@ def test_steps_and_solution_are_those_of_the_block_in_one_piece(kind: str, num_t
         np.testing.assert_allclose(tiled.lever_arm, whole.lever_arm, rtol=0, atol=1e-7)
     if kind == "everything":
         assert tiled.cameras.k1 == -0.03  # the bound is active
+
+
+class _Level(AbstractPrior):
+    """Cameras of some images stand at a height, with no field for a sigma."""
+
+    name: ClassVar[str] = "level"
+    image_index: np.ndarray | jax.Array
+    loss: AbstractLoss = Linear()
+
+    def residual(self, unknowns: Unknowns) -> jax.Array:
+        return unknowns.poses.translation[self.image_index].T / 100
+
+    def rows(self, unknowns: Unknowns) -> Rows:
+        along = jnp.zeros((3, 6, len(self.image_index))).at[jnp.arange(3), jnp.arange(3, 6)].set(0.01)
+        return Rows(residual=self.residual(unknowns), pose=JacobianBlock(self.image_index, along))
+
+
+def test_a_prior_without_sigmas_counts_its_own_rows_alone() -> None:
+    # breaks where it is filled up to a round number with copies of a row, in one piece or in tiles
+    plain = _fixed()
+    problem = eqx.tree_at(lambda p: p.priors, plain, (*plain.priors, _Level(np.arange(33))))
+    whole = jaxba.solve(problem, **_TIGHT)
+    of_level = np.sum(problem.poses.translation[:33] ** 2) / 100**2 / 2
+    np.testing.assert_allclose(whole.initial_cost, jaxba.solve(plain, max_nfev=1).initial_cost + of_level, rtol=1e-12)
+    tiled = jaxba.solve_tiled(problem, num_tiles=2, **_TIGHT)
+    np.testing.assert_allclose(tiled.final_cost, whole.final_cost, rtol=1e-9)
 
 
 def test_files_and_workers_do_not_change_a_byte() -> None:

@@ -1,7 +1,7 @@
 import psutil
 import pytest
 
-from jaxba import JaxbaError
+from jaxba import JaxbaError, _sizes
 from jaxba._sizes import bytes_of, machine_memory
 from jaxba.engine import Resources, _workers, changed
 from jaxba.engine._workers import memory_for

@@ -14,7 +14,7 @@ from jaxba.geometry import AbstractLoss, Linear
 
 
 class LeverArmPrior(AbstractPrior):
-    """Measured lever arm: `xyz` metres in the camera's frame, `std_m` a sigma an axis; one row, or none."""
+    """Measured lever arm: `xyz` metres in the camera's frame, `std_m` a sigma an axis; a row a measurement."""
 
     name: ClassVar[str] = "lever_arm"
     in_world: ClassVar[tuple[str, ...] | None] = ()

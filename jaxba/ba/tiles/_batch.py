@@ -73,44 +73,43 @@ def solve_batch(
     solutions: dict[int, Solution] = {}
 
     def adjust(number: int) -> None:
-        prepared, plan, begun, since = work[number]
+        prepared, plan, seconds = work[number]
         with jax.enable_x64(True):  # of this thread
-            begun += time.perf_counter() - since  # what others took in between is not its own
+            begun = time.perf_counter() - seconds
             solutions[number] = solve_prepared(prepared, plan, loss, solver, max_nfev, np.float64, None, begun)
         if callback is not None:
             callback(number, solutions[number])
 
-    first_of_shape = {plan.shape: number for number, (_, plan, _, _) in reversed(list(enumerate(work)))}
+    first_of_shape = {plan.shape: number for number, (_, plan, _) in reversed(list(enumerate(work)))}
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(int(workers)) as pool:
         for numbers in (sorted(first_of_shape.values()), sorted(set(range(len(work))) - set(first_of_shape.values()))):
             list(pool.map(adjust, numbers))  # the first of each shape compiles for the others
     return [solutions[number] for number in range(len(work))]
 
 
-def _arranged(problems: Sequence[Problem]) -> list[tuple[Prepared, Plan, float, float]]:
-    """Return each problem checked, with a plan of its group's shape, and when work on that began and ended."""
-    checked: list[tuple[Prepared, Plan, float, float]] = []
+def _arranged(problems: Sequence[Problem]) -> list[tuple[Prepared, Plan, float]]:
+    """Return each problem checked, with a plan of its group's shape, and the seconds that this took."""
+    checked: list[tuple[Prepared, Plan, float]] = []
     for number, problem in enumerate(problems):
         begun = time.perf_counter()
         try:
             prepared = prepare(problem)
         except JaxbaError as error:
             raise JaxbaError(f"solve_batch: problem {number} of {len(problems)}: {error}") from error
-        checked.append((prepared, make_plan(prepared.problem), begun, time.perf_counter()))
+        checked.append((prepared, make_plan(prepared.problem), time.perf_counter() - begun))
     kinds: dict[Any, list[int]] = {}
-    for number, (prepared, plan, _, _) in enumerate(checked):
+    for number, (prepared, plan, _) in enumerate(checked):
         kinds.setdefault(_kind(prepared.problem, plan), []).append(number)
     for numbers in kinds.values():
         for group in alike([checked[number][0].problem.num_observations for number in numbers], _LIKE):
             of_group = [numbers[k] for k in group]
             shape = functools.reduce(larger, (checked[number][1].shape for number in of_group))
             for number in of_group:
-                prepared, plan, begun, ended = checked[number]
+                prepared, plan, seconds = checked[number]
+                begun = time.perf_counter()
                 if plan.shape != shape:
-                    again = time.perf_counter()
                     plan = make_plan(prepared.problem, like=shape)
-                    begun, ended = begun + again - ended, time.perf_counter()
-                checked[number] = prepared, plan, begun, ended
+                checked[number] = prepared, plan, seconds + time.perf_counter() - begun
     return checked
 
 

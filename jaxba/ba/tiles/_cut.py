@@ -1,8 +1,8 @@
 """Cut a problem into the tiles of a tree: each holds some points with all their observations and the images of these.
 
-Every row of every prior goes to one tile: those of a point to its own, those of an image to the first one that sees it,
-the others to the first tile, as do images that see nothing. Tiles of like sizes get like shapes, so that they share
-what is compiled.
+Every row of every prior goes to one tile: those of a point to its own, those of an image, or of its own camera, to the
+first one that the image has points in, the others to the first tile, as do images that see nothing. Tiles of like sizes
+get like shapes, so that they share what is compiled.
 """
 
 import dataclasses
@@ -65,7 +65,11 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
     for number in reversed(range(len(rows_of_tile))):
         owner[np.asarray(seen.image_index)[rows_of_tile[number]]] = number
     unseen = np.bincount(np.asarray(seen.image_index), minlength=problem.num_images) == 0
-    tile_of_prior = [_tile_of_rows(prior, owner, tree.tile_of_point) for prior in problem.priors]
+    of_cameras = np.zeros(problem.num_cameras, np.int32)
+    if shape.own_cameras:  # else every tile has all cameras
+        of_cameras[np.asarray(problem.camera_index)] = owner
+    owners = {"image_index": owner, "point_index": tree.tile_of_point, "camera_index": of_cameras}
+    tile_of_prior = [_tile_of_rows(prior, owners) for prior in problem.priors]
 
     def part(number: int, like: PlanShape) -> tuple[Problem, Tile]:
         rows = rows_of_tile[number]
@@ -84,10 +88,9 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
             yield number, tile, make_system(found, tile.plan, loss)
 
 
-def _tile_of_rows(
-    prior: AbstractPrior, owner: Int[np.ndarray, " images"], tile_of_point: Int[np.ndarray, " points"]
-) -> Int[np.ndarray, " rows"]:
-    for name, tiles in (("image_index", owner), ("point_index", tile_of_point)):
+def _tile_of_rows(prior: AbstractPrior, owners: dict[str, Int[np.ndarray, " _"]]) -> Int[np.ndarray, " rows"]:
+    """Return the tile of each row; `owners` tells it of images, points and cameras by the name of their index."""
+    for name, tiles in owners.items():
         if hasattr(prior, name):
             return tiles[np.asarray(getattr(prior, name))]
     return np.zeros(num_rows(prior), np.int32)

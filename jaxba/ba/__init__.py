@@ -3,7 +3,8 @@
 from jaxba.ba._check_gradients import GradientCheck, GradientRow, check_gradients
 from jaxba.ba._compiler import fast_jit
 from jaxba.ba._covariance import Covariance, covariance
-from jaxba.ba._plan import Plan, PlanShape, make_plan
+from jaxba.ba._plan import Plan, make_plan
+from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors

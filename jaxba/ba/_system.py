@@ -17,7 +17,8 @@ from jax.core import Tracer
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, PlanShape, make_plan
+from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, make_plan
+from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._projection import camera_centers
 from jaxba.ba._unknowns import Step, Unknowns

@@ -13,7 +13,8 @@ from small_problems import EVERY_CAMERA, RADIAL, small_problem
 
 import jaxba
 from jaxba.ba import Observations, Problem
-from jaxba.ba._plan import ROW_RUN, bucket, make_plan
+from jaxba.ba._plan import ROW_RUN, make_plan
+from jaxba.ba._plan_shape import bucket
 from jaxba.ba._solvers import SchurLevenbergMarquardt
 from jaxba.ba._system import initial_unknowns, make_system, restore
 from jaxba.geometry import Linear

@@ -18,7 +18,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._plan import Plan, alike, larger, make_plan
+from jaxba.ba._plan import Plan, make_plan
+from jaxba.ba._plan_shape import alike, larger
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import Solution
 from jaxba.ba._solve import SOLVERS, Method, require_stops, solve, solve_prepared

@@ -13,7 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.ba._plan import Plan, PlanShape, alike, bare_shape, larger, make_plan, num_rows
+from jaxba.ba._plan import Plan, make_plan
+from jaxba.ba._plan_shape import PlanShape, alike, bare_shape, larger, num_rows
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._system import System, arrange, make_system, restore
 from jaxba.ba._unknowns import Unknowns

@@ -24,7 +24,7 @@ from jaxba.ba._compiler import call_compiled, compile_ahead
 from jaxba.ba._factor import box_minimum
 from jaxba.ba._lengths import MIN_DIAGONAL
 from jaxba.ba._linearise import costs, linearise
-from jaxba.ba._plan import bare_shape
+from jaxba.ba._plan_shape import bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._solvers import SchurLevenbergMarquardt, State, Tried, projected_gradient_norm
 from jaxba.ba._system import System

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._descend import walk
-from jaxba.ba._plan import bare_shape
+from jaxba.ba._plan_shape import bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import require_stops

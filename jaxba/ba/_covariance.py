@@ -1,29 +1,31 @@
 """Covariance: marginal covariances of poses, intrinsics, lever arm and points at a problem's present values.
 
-The blocks of (J^T J)^-1 that belong to one image, camera or point; how they are computed stands in `_marginals.py`.
+The blocks of (J^T J)^-1 that belong to one image, camera or point. They are computed tile by tile, as steps are by
+`solve_tiled`, and no inverse of the whole is ever there; see `tiles/_inverse.py`.
 Poses are tangent steps (w in rad, v in metres) in the camera's frame, as `Pose.retract` takes them.
-
-Cost: 500 images with 33k points take 0.9 s on two cores, after 5 s to compile, and 0.3 GB beside what is loaded.
 """
 
 import dataclasses
+import os
+from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._marginals import Marginals, marginals
-from jaxba.ba._plan import Plan, make_plan
+from jaxba.ba._plan_shape import PlanShape, bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import rotation_matrices
-from jaxba.ba._system import System, initial_unknowns, make_system
+from jaxba.ba._system import own_unknowns
 from jaxba.ba._unknowns import Unknowns
+from jaxba.ba._variance_factor import variance_factor
 from jaxba.ba.checks import Dropped, prepare, require_gauge
+from jaxba.ba.tiles._dense import NotPositive
+from jaxba.ba.tiles._engine import Engine
+from jaxba.ba.tiles._inverse import Marginals, compile_marginals, marginals
+from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
-MAX_UNKNOWNS = 6500  # 1000 images with one camera take 5 s and 0.8 GB beside what is loaded
 _PROBING = 1e-9  # damping, relative, under which a singular system shows where it is weak
 _MAX_INFLATION = 1e13  # of a variance by the other unknowns: beyond it rounding has eaten the answer
 
@@ -56,13 +58,22 @@ class Covariance:
     dropped: Dropped
 
 
-def covariance(problem: Problem, *, loss: AbstractLoss | None = None) -> Covariance:
+def covariance(
+    problem: Problem,
+    *,
+    loss: AbstractLoss | None = None,
+    max_memory: float | str | None = None,
+    max_observations: float = TILE_OBSERVATIONS,
+    folder: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+) -> Covariance:
     """Return the covariances at the problem's present values; call it on `solution.apply(problem)`.
 
     - `loss`: as given to `solve`; rows count with the weight that it gives them (least squares if None).
+    - `max_memory`, `max_observations`, `folder`, `workers`: as in `solve_tiled`.
 
-    Raises `JaxbaError` where the problem has no gauge, where something in it is not determined, and beyond
-    `MAX_UNKNOWNS` unknowns of images and cameras.
+    Raises `JaxbaError` where the problem has no gauge, where something in it is not determined, and where memory or
+    disk do not suffice.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(8)
@@ -70,33 +81,42 @@ def covariance(problem: Problem, *, loss: AbstractLoss | None = None) -> Covaria
     >>> found.poses.shape, found.points.shape[1:], found.border_names[:2]
     ((8, 6, 6), (3, 3), ('camera 0 fx', 'camera 0 fy'))
     """
-    if loss is not None:
-        check_loss("covariance: loss", loss)
+    loss = Linear() if loss is None else loss
+    check_loss("covariance: loss", loss)
     prepared = prepare(problem)
     problem = prepared.problem
     require_gauge(problem, "Covariance")
-    plan = make_plan(problem)
-    _check_size(plan)
-    with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
-        system: System = jax.device_put(make_system(problem, plan, _as_arrays(Linear() if loss is None else loss)))
-        unknowns: Unknowns = jax.device_put(initial_unknowns(problem, plan))
-        num_free = np.array(_num_free(problem))
-        found = jax.device_get(marginals(system, plan, unknowns, num_free, np.array(0.0)))
-        if not _determined(found):
-            damped = marginals(system, plan, unknowns, num_free, np.array(_PROBING))
-            weakest = _weakest(jax.device_get(damped), plan, problem)
+    unknowns = own_unknowns(problem)
+    room: dict[str, Any] = {
+        "max_memory": max_memory,
+        "max_observations": max_observations,
+        "folder": folder,
+        "workers": workers,
+    }
+    with opened("covariance", problem, loss, inverse=True, **room) as engine:
+        compile_marginals(engine, unknowns)
+        found = _marginals(engine, unknowns, 0.0)
+        if found is None or not _determined(found):
+            weakest = _weakest(_marginals(engine, unknowns, _PROBING), problem)
             raise JaxbaError(
                 f"Covariance: the measurements do not determine {weakest}. Hold it fixed or add a prior; an image "
                 "needs three points or more that others see, and intrinsics need views from different heights or sides."
             )
-    return _in_order(found, plan, problem, prepared.dropped)
+    return _in_order(found, [loss, *(prior.loss for prior in problem.priors)], problem, prepared.dropped)
 
 
-def _in_order(found: Marginals, plan: Plan, problem: Problem, dropped: Dropped) -> Covariance:
-    """Return the covariances in the problem's order, without padding, zero for what is fixed."""
-    shape, free = plan.shape, problem.free
-    rank = np.argsort(plan.image_order)
-    blocks = np.asarray(found.blocks)[rank]
+def _marginals(engine: Engine, unknowns: Unknowns, damping: float) -> Marginals | None:
+    """Return the marginals, or None where there are none."""
+    try:
+        return marginals(engine, unknowns, damping)
+    except NotPositive:
+        return None
+
+
+def _in_order(found: Marginals, losses: list[AbstractLoss], problem: Problem, dropped: Dropped) -> Covariance:
+    """Return the covariances, zero for what is fixed."""
+    shape, free = bare_shape(problem), problem.free
+    blocks = found.blocks
     poses = blocks[:, :6, :6] * np.asarray(free.poses)[:, None, None]
     rotation = rotation_matrices(problem.poses)
     centers = np.swapaxes(rotation, 1, 2) @ poses[:, 3:, 3:] @ rotation
@@ -107,7 +127,7 @@ def _in_order(found: Marginals, plan: Plan, problem: Problem, dropped: Dropped) 
     free_intrinsics = np.asarray(free.intrinsics)
     shared_free = np.zeros(0, bool) if shape.own_cameras else free_intrinsics[:, refined].reshape(-1)
     border_free = np.append(shared_free, np.ones(shape.border - num_shared, bool))
-    border = np.asarray(found.border) * np.outer(border_free, border_free)
+    border = found.border * np.outer(border_free, border_free)
     intrinsics = np.zeros((num_cameras, len(names), len(names)))
     if shape.own_cameras:
         intrinsics[np.ix_(np.asarray(problem.camera_index), refined, refined)] = blocks[:, 6:, 6:]
@@ -116,22 +136,23 @@ def _in_order(found: Marginals, plan: Plan, problem: Problem, dropped: Dropped) 
         of_cameras = border[:num_shared, :num_shared].reshape(num_cameras, len(refined), num_cameras, len(refined))
         cameras = np.arange(num_cameras)
         intrinsics[np.ix_(cameras, refined, refined)] = of_cameras[cameras, :, cameras]
+    factor, redundancy = variance_factor(losses, found.squares, _num_free(problem))
     return Covariance(
         poses=poses,
         centers=centers,
         intrinsics=intrinsics,
         lever_arm=border[num_shared:, num_shared:] if shape.lever_arm else np.zeros((3, 3)),
-        points=np.asarray(found.points)[np.argsort(plan.point_order)],
+        points=found.points,
         border=border,
-        border_names=_border_names(plan, problem),
-        variance_factor=float(found.variance_factor),
-        redundancy=int(found.redundancy),
+        border_names=_border_names(shape, problem),
+        variance_factor=factor,
+        redundancy=redundancy,
         dropped=dropped,
     )
 
 
-def _border_names(plan: Plan, problem: Problem) -> tuple[str, ...]:
-    names, shape = type(problem.cameras).parameter_names(), plan.shape
+def _border_names(shape: PlanShape, problem: Problem) -> tuple[str, ...]:
+    names = type(problem.cameras).parameter_names()
     cameras = 0 if shape.own_cameras else problem.num_cameras
     refined = [n for n, r in zip(names, shape.refined, strict=True) if r]
     shared = [f"camera {c} {n}" for c in range(cameras) for n in refined]
@@ -144,34 +165,17 @@ def _num_free(problem: Problem) -> int:
     return int(blocks + np.count_nonzero(free.intrinsics))
 
 
-def _check_size(plan: Plan) -> None:
-    shape = plan.shape
-    size = len(plan.image_order) * shape.block + shape.border
-    if size > MAX_UNKNOWNS:
-        raise JaxbaError(
-            f"Covariance: {size} unknowns of images and cameras, the limit is {MAX_UNKNOWNS} (their inverse is dense). "
-            "Take a part of the block, or hold intrinsics fixed that each image has of its own."
-        )
-
-
 def _determined(found: Marginals) -> bool:
     inflation = np.append(np.ravel(found.block_inflation), found.border_inflation)
     return bool(np.isfinite(found.points).all() and np.max(inflation, initial=0.0) < _MAX_INFLATION)
 
 
-def _weakest(damped: Marginals, plan: Plan, problem: Problem) -> str:
+def _weakest(damped: Marginals | None, problem: Problem) -> str:
     """Name the unknown whose variance the others inflate most, from a system damped until it has an inverse."""
-    of_images = np.asarray(damped.block_inflation)[: len(plan.image_order)]
-    of_border = np.asarray(damped.border_inflation)
-    if not (np.isfinite(of_images).all() and np.isfinite(of_border).all()):
+    if damped is None or not (np.isfinite(damped.block_inflation).all() and np.isfinite(damped.border_inflation).all()):
         return "some of the points"
+    of_images, of_border = damped.block_inflation, damped.border_inflation
     if np.max(of_border, initial=0.0) > of_images.max():
-        return _border_names(plan, problem)[int(np.argmax(of_border))]
+        return _border_names(bare_shape(problem), problem)[int(np.argmax(of_border))]
     image, column = np.unravel_index(np.argmax(of_images), of_images.shape)
-    label = problem.image_label(int(plan.image_order[image]))
-    return f"the {'pose' if column < 6 else 'camera'} of {label}"
-
-
-def _as_arrays(loss: AbstractLoss) -> AbstractLoss:
-    """Losses whose scales are arrays share compiled code."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), loss)
+    return f"the {'pose' if column < 6 else 'camera'} of {problem.image_label(int(image))}"

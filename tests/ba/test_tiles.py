@@ -247,7 +247,7 @@ def test_files_and_workers_do_not_change_a_byte() -> None:
     once = jaxba.solve_tiled(problem, **options, workers=1)
     again = jaxba.solve_tiled(problem, **options, workers=3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxba.ba.tiles._solve_tiled.plan_memory", lambda *_: Budget(0.0, 0.0, 0.0))
+        patch.setattr("jaxba.ba.tiles._opened.plan_memory", lambda *_: Budget(0.0, 0.0, 0.0))
         in_files = jaxba.solve_tiled(problem, **options, workers=2)
     for other in (again, in_files):
         values, others = (jax.tree.leaves(dataclasses.replace(solution, report=None)) for solution in (once, other))
@@ -260,7 +260,7 @@ def test_a_full_disk_names_the_folder_and_the_cure(tmp_path: object, monkeypatch
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("jaxba.ba.tiles._solve_tiled.plan_memory", lambda *_: Budget(0.0, 0.0, 0.0))
+    monkeypatch.setattr("jaxba.ba.tiles._opened.plan_memory", lambda *_: Budget(0.0, 0.0, 0.0))
     monkeypatch.setattr(_shelf.np, "save", full)
     with pytest.raises(JaxbaError, match=f"{tmp_path}.*No space left on device.*free there.*max_memory"):
         jaxba.solve_tiled(_everything(), num_tiles=4, folder=str(tmp_path))
@@ -293,13 +293,13 @@ def test_a_front_that_is_not_positive_definite_raises_the_damping(monkeypatch: p
     problem, loss = _KINDS["everything"][0](), _KINDS["everything"][1]
     eliminate, calls = Engine._eliminate, []
 
-    def fails_at_first(self: Engine, number: int, *arguments: object) -> np.ndarray:
+    def fails_at_first(self: Engine, number: int, *arguments: object, **options: object) -> np.ndarray:
         calls.append(number)
         if len(calls) == 5:
-            from jaxba.ba.tiles._fronts import NotPositive
+            from jaxba.ba.tiles._dense import NotPositive
 
             raise NotPositive
-        return eliminate(self, number, *arguments)
+        return eliminate(self, number, *arguments, **options)
 
     monkeypatch.setattr(Engine, "_eliminate", fails_at_first)
     solution = jaxba.solve_tiled(problem, loss=loss, num_tiles=4, **_TIGHT)

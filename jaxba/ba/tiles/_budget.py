@@ -1,4 +1,4 @@
-"""Budget: what a solve in tiles needs of the memory that it may use, told before it begins.
+"""Budget: what work in tiles needs of the memory that it may use, told before it begins.
 
 Held throughout: the problem, and unknowns of all images and points. A tile that is worked on takes some
 `_BYTES_PER_OBSERVATION` and its fronts; on the way up, the fronts that wait for their parents lie in memory as well.
@@ -29,7 +29,7 @@ class Budget(NamedTuple):
     idle: float
 
 
-def memory_limit(max_memory: float | str | None) -> float:
+def memory_limit(label: str, max_memory: float | str | None) -> float:
     """Return the bytes that the process may hold.
 
     Raises `JaxbaError` for what is no amount.
@@ -39,25 +39,34 @@ def memory_limit(max_memory: float | str | None) -> float:
     limit = bytes_of(max_memory, machine_memory())
     if not limit >= 1e8:
         raise JaxbaError(
-            f"solve_tiled: max_memory {max_memory!r}: give an amount from 100MB such as 4GB, or a share of the "
+            f"{label}: max_memory {max_memory!r}: give an amount from 100MB such as 4GB, or a share of the "
             "machine's memory such as 0.5."
         )
     return limit
 
 
-def plan_memory(problem: Problem, fronts: Fronts, limit: float, tile_observations: float, workers: int) -> Budget:
+def plan_memory(
+    label: str,
+    problem: Problem,
+    fronts: Fronts,
+    limit: float,
+    tile_observations: float,
+    workers: int,
+    fronts_in_work: float,
+) -> Budget:
     """Return how the memory is shared out.
 
     - `limit`: bytes that the process may hold. `tile_observations`: of the largest tile.
+    - `fronts_in_work`: bytes that fronts take at a time.
 
     Raises `JaxbaError` where that is too little to work at all.
     """
     held = used_memory() + _COMPILED + _BYTES_PER_POINT * problem.num_points
-    work = workers * _BYTES_PER_OBSERVATION * tile_observations + fronts.bytes_in_work(workers)
+    work = workers * _BYTES_PER_OBSERVATION * tile_observations + fronts_in_work
     left = _USED * (limit - held - work)
     if left < 0:
         raise JaxbaError(
-            f"solve_tiled: {size_text(held + work)} are needed: {size_text(held)} for the problem with "
+            f"{label}: {size_text(held + work)} are needed: {size_text(held)} for the problem with "
             f"{problem.num_points:,} points and what is loaded, {size_text(work)} for {workers} tiles of up to "
             f"{tile_observations:,.0f} observations in work and the fronts between them. {size_text(limit)} are "
             "allowed; give more max_memory, fewer workers or smaller tiles (max_observations)."

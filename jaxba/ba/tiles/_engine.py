@@ -11,7 +11,7 @@ number of threads.
 
 import functools
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from jaxba.ba._compiler import call_compiled, compile_ahead
 from jaxba.ba._factor import box_minimum
 from jaxba.ba._lengths import MIN_DIAGONAL
-from jaxba.ba._linearise import costs, linearise
+from jaxba.ba._linearise import Linearisation, costs, linearise
 from jaxba.ba._plan_shape import bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._solvers import SchurLevenbergMarquardt, State, Tried, projected_gradient_norm
@@ -31,8 +31,9 @@ from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.ba.tiles._budget import Budget
 from jaxba.ba.tiles._cut import Tile, cut
+from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._dissect import Tree
-from jaxba.ba.tiles._fronts import Fronts, NotPositive, TileFronts
+from jaxba.ba.tiles._fronts import Factor, Fronts, TileFronts
 from jaxba.ba.tiles._programs import Handed, Sums, hand_over, put_back
 from jaxba.ba.tiles._shelf import Shelf
 from jaxba.geometry import AbstractLoss, Pose
@@ -40,19 +41,34 @@ from jaxba.geometry import AbstractLoss, Pose
 _T = TypeVar("_T")
 
 
-class _Up(NamedTuple):
-    """What a tile gives on the way up: what it hands on, and its part of gradient and diagonal in its own order."""
+class Up(NamedTuple):
+    """What a tile gives on the way up, in its own order, or all of them together, in the problem's.
+
+    - `update`: what is handed on; of all together that of the root, over the tail.
+    - `gradient`, `squares`: see `Linearisation`; those of points are left out. `steepest`: their largest gradient.
+    - `diagonal`, `border_diagonal`: of the reduced system before anything is eliminated from it, damped.
+    """
 
     update: np.ndarray
     gradient: Step
     squares: Step
     steepest: float
+    diagonal: Float[np.ndarray, "images block"]
+    border_diagonal: Float[np.ndarray, " border"]
+
+
+class Call(NamedTuple):
+    """A compiled program with arguments of the shapes that it is called with."""
+
+    program: Callable[..., Any]
+    arguments: tuple[Any, ...]
 
 
 class Engine:
     """A problem in tiles, ready for steps.
 
     - `budget`: how much of systems, factors and equations stays in memory. `folder`: for files of the rest.
+    - `pool`: threads for the fronts above the tiles.
     """
 
     def __init__(
@@ -63,8 +79,10 @@ class Engine:
         fronts: Fronts,
         budget: Budget,
         folder: Path,
+        pool: ThreadPoolExecutor,
         workers: int,
     ) -> None:
+        self.pool = pool
         self.shape, self.tree, self.fronts, self.workers = bare_shape(problem), tree, fronts, workers
         self.shelf, self.models = Shelf(budget.shelf, folder), Shelf(budget.models)
         fronts.memory.limit = budget.idle
@@ -88,49 +106,48 @@ class Engine:
         self.tops = [number for number in range(len(tree.nodes)) if number not in below]
         self.tile_of_node = {fronts.last: number for number, (_, fronts) in enumerate(self.tiles)}
 
-    def compile(self, unknowns: Unknowns) -> None:
-        """Compile the work on tiles, two programs at a time; without it that happens at the first step."""
+    def compile(
+        self, unknowns: Unknowns, calls: Callable[[System, Unknowns, Linearisation], list[Call]] | None = None
+    ) -> None:
+        """Compile the work on tiles, two programs at a time; without it that happens when it is first done.
+
+        - `calls`: what is called beside the way up, from a tile's system, unknowns and equations: for a step if None.
+        """
         one_of_shape = {tile.plan.shape: number for number, (tile, _) in enumerate(self.tiles)}
 
-        def compile_one(program: Callable[..., Any], *arguments: Any) -> None:
+        def compile_one(call: Call) -> None:
             with jax.enable_x64(True):  # of this thread
-                compile_ahead(program, *arguments)
+                compile_ahead(call.program, *call.arguments)
 
         with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
             done = []
-            for shape, number in one_of_shape.items():
-                system, part, scalar = self._system(number), self.tiles[number][0].take(unknowns), np.zeros(())
+            for number in one_of_shape.values():
+                system, part, scalar = self.system(number), self.tiles[number][0].take(unknowns), np.zeros(())
                 model = jax.eval_shape(linearise, system, part, scalar)
-                solution = np.zeros((shape.num_images, shape.block)), np.zeros(shape.border)
-                of_step = system, part, model, *solution, model.gradient, scalar, scalar
-                done += [
-                    pool.submit(compile_one, put_back, *of_step),
-                    pool.submit(compile_one, hand_over, system, model, scalar),
-                    pool.submit(compile_one, linearise, system, part, scalar),
-                    pool.submit(compile_one, costs, system, part),
-                ]
-            for each in done:
-                each.result()
+                done += (calls or _calls_of_step)(system, part, model)
+                done += [Call(hand_over, (system, model, scalar)), Call(linearise, (system, part, scalar))]
+            list(pool.map(compile_one, done))
 
     def costs(self, unknowns: Unknowns) -> tuple[float, float]:
         """Return the cost, and the cost without robust losses."""
 
         def of_tile(number: int) -> tuple[float, float]:
-            found = call_compiled(costs, self._system(number), self.tiles[number][0].take(unknowns))
+            found = call_compiled(costs, self.system(number), self.tiles[number][0].take(unknowns))
             return float(found[0]), float(found[1])
 
-        robust, plain = np.sum(list(self._each_tile(of_tile)), axis=0)
+        robust, plain = np.sum(list(self.each_tile(of_tile)), axis=0)
         return robust, plain
 
     def step(self, solver: SchurLevenbergMarquardt, unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
         """Return the unknowns and the state after a step was tried."""
         damping, bend = np.asarray(state.trust), np.asarray(state.bend)
         try:
-            gradient, steepest, border = self._up(unknowns, damping, bend)
+            up = self.up(unknowns, damping, bend)
         except NotPositive:
             return unknowns, call_compiled(_judge_with(solver), state, jax.tree.map(np.asarray, _NOTHING_TRIED))
-        trial, sums, squared_norm = self._down(unknowns, border, damping, bend)
-        of_all = Step(gradient.poses, gradient.intrinsics, gradient.lever_arm, np.array([[steepest, 0.0, 0.0]]))
+        trial, sums, squared_norm = self._down(unknowns, self._border(unknowns, up.update), damping, bend)
+        gradient = up.gradient
+        of_all = Step(gradient.poses, gradient.intrinsics, gradient.lever_arm, np.array([[up.steepest, 0.0, 0.0]]))
         tried = _NOTHING_TRIED | {
             "cost": sums.cost,
             "promised": -sums.slope - sums.curvature / 2,
@@ -146,21 +163,37 @@ class Engine:
         judged = call_compiled(_judge_with(solver), state, jax.tree.map(np.asarray, tried))
         return (trial if judged.accepted else unknowns), judged
 
-    def _system(self, number: int) -> System:
+    def system(self, number: int) -> System:
+        """Return the system of a tile."""
         return self.shelf.get(("system", number))
 
-    def _up(
-        self, unknowns: Unknowns, damping: Float[np.ndarray, ""], bend: Float[np.ndarray, ""]
-    ) -> tuple[Step, float, Float[np.ndarray, " border"]]:
-        """Return the gradient but for points, its largest entry there, and the border's solution; keep the factors."""
+    def factor(self, number: int) -> Factor:
+        """Return the factor of a node, as the last way up has left it."""
+        return self.shelf.get(("factor", number))
+
+    def equations(self, number: int, part: Unknowns, bend: Float[np.ndarray, ""]) -> Linearisation:
+        """Return a tile's equations: those of the last way up, or the same computed again."""
+        model = self.models.get(number)
+        return call_compiled(linearise, self.system(number), part, bend) if model is None else model
+
+    def up(self, unknowns: Unknowns, damping: Float[np.ndarray, ""], bend: Float[np.ndarray, ""]) -> Up:
+        """Eliminate all but the border, and keep the factors.
+
+        - `damping`, `bend`: see `State`.
+
+        Raises `NotPositive` where the damped equations have no factor.
+        """
         gradient, squares = (jax.tree.map(np.zeros_like, self.free) for _ in range(2))
+        diagonal, of_border = np.zeros((len(self.tree.rank), self.shape.block)), np.zeros(self.shape.border)
         updates: dict[int, np.ndarray] = {}
-        steepest, results = 0.0, self._each_tile(functools.partial(self._up_tile, unknowns, damping, bend))
+        steepest, results = 0.0, self.each_tile(functools.partial(self._up_tile, unknowns, damping, bend))
         for number in self.tops:
             if number in self.tile_of_node:
                 tile, found = self.tiles[self.tile_of_node[number]][0], next(results)
                 updates[number] = found.update
                 steepest = max(steepest, found.steepest)
+                diagonal[tile.order] += found.diagonal
+                of_border += found.border_diagonal
                 for total, part in ((gradient, found.gradient), (squares, found.squares)):
                     total.poses[tile.order] += part.poses
                     total.intrinsics[tile.solver_cameras] += part.intrinsics
@@ -169,16 +202,17 @@ class Engine:
             node = self.tree.nodes[number]
             images, _ = self._reduced(self._damping(squares, damping), self.camera_index)
             handed_on = [updates.pop(child) for child in node.children]
-            updates[number] = self._eliminate(number, handed_on, images[node.eliminated])
+            updates[number] = self._eliminate(number, handed_on, images[node.eliminated], pool=self.pool)
         (top,) = updates.values()
-        _, on_border = self._reduced(self._damping(squares, damping), self.camera_index)
-        return gradient, steepest, self._border(unknowns, top, on_border)
+        images, on_border = self._reduced(self._damping(squares, damping), self.camera_index)
+        np.einsum("ii->i", top)[: len(on_border)] += on_border
+        return Up(top, gradient, squares, steepest, diagonal + images, of_border + on_border)
 
     def _up_tile(
         self, unknowns: Unknowns, damping: Float[np.ndarray, ""], bend: Float[np.ndarray, ""], number: int
-    ) -> _Up:
+    ) -> Up:
         tile, fronts = self.tiles[number]
-        system = self._system(number)
+        system = self.system(number)
         model = call_compiled(linearise, system, tile.take(unknowns), bend)
         handed: Handed = jax.tree.map(np.asarray, call_compiled(hand_over, system, model, damping))
         self.models.put(number, jax.tree.map(np.asarray, model))
@@ -196,26 +230,26 @@ class Engine:
             handed_on = [updates.pop(child) for child in node.children]
             updates[node_number] = self._eliminate(node_number, handed_on, images[begin:end], part, handed)
             begin = end
-        return _Up(updates[fronts.last], gradient, squares, float(handed.steepest))
+        diagonal = np.diagonal(handed.diagonal[:count], axis1=1, axis2=2)
+        of_border = np.diagonal(handed.corner)[: self.shape.border]
+        return Up(updates[fronts.last], gradient, squares, float(handed.steepest), diagonal, of_border)
 
-    def _eliminate(self, number: int, *arguments: Any) -> np.ndarray:
+    def _eliminate(self, number: int, *arguments: Any, pool: ThreadPoolExecutor | None = None) -> np.ndarray:
         old = self.shelf.release(("factor", number))
         if old is not None:
             self.fronts.forget(old)
-        factor, update = self.fronts.eliminate(number, *arguments)
+        factor, update = self.fronts.eliminate(number, *arguments, pool=pool)
         if not self.shelf.put(("factor", number), factor):
             self.fronts.forget(factor)
         return update
 
-    def _border(
-        self, unknowns: Unknowns, top: Float[np.ndarray, "tail tail"], damping: Float[np.ndarray, " border"]
-    ) -> Float[np.ndarray, " border"]:
+    def _border(self, unknowns: Unknowns, top: Float[np.ndarray, "tail tail"]) -> Float[np.ndarray, " border"]:
         """Return the border's solution from what the root hands on."""
         count = self.shape.border
         if not count:
             return np.zeros(0)
         corner = np.tril(top[:count, :count])
-        corner = corner + np.tril(corner, -1).T + np.diag(damping)
+        corner = corner + np.tril(corner, -1).T
         lower = upper = None
         if self.shape.any_bound:
             lower, upper = (
@@ -239,7 +273,7 @@ class Engine:
         tail[: len(border)], tail[len(border)] = border, -1
         for number in reversed(self.tops):
             if number not in self.tile_of_node:
-                self.fronts.put_back(number, self.shelf.get(("factor", number)), solution, tail)
+                self.fronts.put_back(number, self.factor(number), solution, tail)
         shared = self._shared_step(unknowns, border)
         work = functools.partial(self._down_tile, unknowns, solution, tail, shared, damping, bend)
         trial = Unknowns(
@@ -249,7 +283,7 @@ class Engine:
             unknowns.points.copy(),
         )
         totals = Sums(*[np.zeros(()) for _ in Sums._fields])
-        for (tile, _), (part, sums) in zip(self.tiles, self._each_tile(work), strict=True):
+        for (tile, _), (part, sums) in zip(self.tiles, self.each_tile(work), strict=True):
             tile.put(part, trial)
             totals = Sums(*[total + own for total, own in zip(totals, sums, strict=True)])
         if self.shape.own_cameras:
@@ -270,11 +304,9 @@ class Engine:
     ) -> tuple[Unknowns, Sums]:
         tile, fronts = self.tiles[number]
         for node in reversed(range(fronts.first, fronts.last + 1)):
-            self.fronts.put_back(node, self.shelf.get(("factor", node)), solution, tail)
-        system, part = self._system(number), tile.take(unknowns)
-        model = self.models.get(number)
-        if model is None:
-            model = call_compiled(linearise, system, part, bend)
+            self.fronts.put_back(node, self.factor(node), solution, tail)
+        system, part = self.system(number), tile.take(unknowns)
+        model = self.equations(number, part, bend)
         images = np.zeros((tile.plan.shape.num_images, self.shape.block))
         images[: len(tile.order)] = solution[tile.order]
         intrinsics = shared.intrinsics
@@ -322,21 +354,31 @@ class Engine:
 
         return jax.tree.map(added, squares, free)
 
-    def _each_tile(self, work: Callable[[int], _T]) -> Iterator[_T]:
-        """Yield the results of work on every tile, in order, a few at a time."""
+    def each_tile(self, work: Callable[..., _T], calls: Iterable[tuple[Any, ...]] | None = None) -> Iterator[_T]:
+        """Yield the results of work on tiles, in order, a few at a time.
 
-        def in_double(number: int) -> _T:
+        - `calls`: arguments of each call, taken as workers get free; the numbers of all tiles if None.
+        """
+
+        def in_double(arguments: tuple[Any, ...]) -> _T:
             with jax.enable_x64(True):  # of this thread
-                return work(number)
+                return work(*arguments)
 
         waiting: deque[Future[_T]] = deque()
         with ThreadPoolExecutor(self.workers) as pool:
-            for number in range(len(self.tiles)):
-                waiting.append(pool.submit(in_double, number))
+            for arguments in ((number,) for number in range(len(self.tiles))) if calls is None else calls:
+                waiting.append(pool.submit(in_double, arguments))
                 if len(waiting) > self.workers:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
+
+
+def _calls_of_step(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
+    shape, scalar = system.shape, np.zeros(())
+    solution = np.zeros((shape.num_images, shape.block)), np.zeros(shape.border)
+    of_step = system, part, model, *solution, model.gradient, scalar, scalar
+    return [Call(put_back, of_step), Call(costs, (system, part))]
 
 
 @functools.cache

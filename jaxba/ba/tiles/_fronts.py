@@ -9,37 +9,35 @@ The reduced system and its right-hand side are one symmetric matrix, of the imag
 Each node gathers its part of it in a dense front over its own images, its boundary and the tail, adds what its children
 hand on, and eliminates its own images (Duff and Reid 1983):
 
-    F11 = L L^T        Y = L^-1 F21^T        F22 - Y^T Y goes to the parent.
+    F11 = L L^T        X = F21 L^-T        F22 - X X^T goes to the parent.
 
-So the root hands on C - B^T A^-1 B with its right-hand side, and on the way back `x = -L^-T Y [x_rest, -1]`. BLAS does
-the arithmetic, each front at its own size. Sizes are counted in blocks of an image's unknowns, to which the tail is
-padded; lower triangles alone are filled.
+So the root hands on C - B^T A^-1 B with its right-hand side, and on the way back `x = -L^-T X^T [x_rest, -1]`. The
+inverse Z of the whole comes back the same way, its parts over each front alone (Erisman and Tinney 1975):
+
+    P = L^-T X^T        Z_or = -P Z_rr        Z_oo = F11^-1 + P Z_rr P^T
+
+with o a node's own images and r its boundary and the tail. Sizes are counted in blocks of an image's unknowns, to which
+the tail is padded; lower triangles alone are filled. The arithmetic stands in `_dense.py`.
 """
 
 import itertools
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
+from jaxba.ba.tiles import _dense
 from jaxba.ba.tiles._dissect import Tree
 from jaxba.ba.tiles._programs import Handed, tail_size
 
-(_potrf,) = get_lapack_funcs(("potrf",), dtype=np.float64)
-_trsm, _syrk, _trsv = get_blas_funcs(("trsm", "syrk", "trsv"), dtype=np.float64)
-
 
 class Factor(NamedTuple):
-    """What the way back needs of a node: L^T and Y, in Fortran's order."""
+    """What the way back needs of a node: L, whose upper triangle holds anything, and X."""
 
     root: Float[np.ndarray, "own own"]
-    across: Float[np.ndarray, "own rest"]
-
-
-class NotPositive(Exception):
-    """A front is not positive definite: the damping is too small."""
+    across: Float[np.ndarray, "rest own"]
 
 
 class _Run(NamedTuple):
@@ -176,11 +174,12 @@ class Fronts:
         diagonal: Float[np.ndarray, "own block"],
         part: Part | None = None,
         handed: Handed | None = None,
+        pool: ThreadPoolExecutor | None = None,
     ) -> tuple[Factor, Float[np.ndarray, "rest rest"]]:
         """Fill a node's front and eliminate its images; return its factor and what goes to its parent.
 
         - `handed_on`: by its children. `diagonal`: what is to be added for its own images, such as damping.
-        - `part`, `handed`: of the tile that the node belongs to, if any.
+        - `part`, `handed`: of the tile that the node belongs to, if any. `pool`: threads for large fronts.
 
         Raises `NotPositive` where the front is not positive definite.
         """
@@ -196,15 +195,9 @@ class Fronts:
                 self._extend_add(parts, own, self._runs[child], update)
                 self.memory.give_back(update)
         f11, f21, _ = parts
-        if not own:
-            return Factor(f11.T, f21.T), f22
         np.einsum("ii->i", f11)[:] += diagonal.reshape(-1)
-        root, failed = _potrf(f11.T, lower=0, clean=0, overwrite_a=1)
-        if failed:
-            raise NotPositive
-        across = _trsm(1.0, root, f21.T, lower=0, trans_a=1, overwrite_b=1)
-        _syrk(-1.0, across, beta=1.0, c=f22.T, trans=1, lower=0, overwrite_c=1)
-        return Factor(root, across), f22
+        _dense.factor(f11, f21, f22, pool)
+        return Factor(f11, f21), f22
 
     def put_back(
         self, number: int, factor: Factor, solution: Float[np.ndarray, "images block"], tail: Float[np.ndarray, " tail"]
@@ -217,8 +210,49 @@ class Fronts:
         if not len(node.eliminated):
             return
         rest = np.concatenate([solution[node.boundary].reshape(-1), tail])
-        own = _trsv(factor.root, factor.across @ rest, lower=0)
+        own = _dense.solve_transposed(factor.root, rest @ factor.across)
         solution[node.eliminated] = -own.reshape(-1, self.block)
+
+    def inverse(
+        self, factor: Factor, of_rest: Float[np.ndarray, "rest rest"], pool: ThreadPoolExecutor | None = None
+    ) -> Float[np.ndarray, "front front"]:
+        """Return the inverse over a node's own images, its boundary and the tail, from that over the last two."""
+        if not len(factor.root):
+            return of_rest
+        size = len(factor.root) + len(of_rest)
+        whole = self.memory.take(size, size)
+        _dense.inverse(factor.root, factor.across, of_rest, whole, pool)
+        return whole
+
+    def diagonal_blocks(self, whole: Float[np.ndarray, "front front"]) -> Float[np.ndarray, "images block block"]:
+        """Return the diagonal blocks of a matrix over a front, its tail's included."""
+        count = len(whole) // self.block
+        places = np.arange(count)
+        return whole.reshape(count, self.block, count, self.block)[places, :, places]
+
+    def take_blocks(
+        self,
+        number: int,
+        whole: Float[np.ndarray, "front front"],
+        part: Part,
+        off_diagonal: Float[np.ndarray, "blocks block block"],
+    ) -> None:
+        """Copy the blocks of a matrix over a node's front to where a tile's blocks for that front came from."""
+        count, own = len(whole) // self.block, self.own[number]
+        blocks = whole.reshape(count, self.block, count, self.block)
+        for source, (row, column) in zip(part.off_diagonal, ((0, 0), (own, 0), (own, own)), strict=True):
+            off_diagonal[source.index] = blocks[source.row + row, :, source.column + column]
+
+    def of_child(self, child: int, whole: Float[np.ndarray, "front front"]) -> Float[np.ndarray, "rest rest"]:
+        """Return a matrix over a node's front where it concerns the boundary of a child, and the tail."""
+        size = (len(self.ranks[child]) - self.own[child] + self.tail) * self.block
+        part = np.empty((size, size))
+        runs = [(slice(s * self.block, (s + n) * self.block), slice(p * self.block, (p + n) * self.block))
+                for s, p, n in self._runs[child]]  # fmt: skip
+        for to_rows, rows in runs:
+            for to_columns, columns in runs:
+                part[to_rows, to_columns] = whole[rows, columns]
+        return part
 
     def forget(self, factor: Factor) -> None:
         """Take back the memory of a factor that is no longer needed."""
@@ -236,6 +270,17 @@ class Fronts:
             waiting += handed[number] - sum(handed[list(node.children)])
         ahead = sorted(whole[list(self.tree.tiles)])[-2 * workers :]  # tiles that are done before their turn
         return float(most + sum(ahead))
+
+    def bytes_in_inverse(self) -> float:
+        """Return the most that parts of the inverse take at a time, on the way to the tile that is worked on."""
+        block, own = self.block, np.array(self.own, float)
+        rest = np.array([len(ranks) for ranks in self.ranks]) - own + self.tail
+        part, whole = 8 * (rest * block) ** 2, 8 * ((own + rest) * block) ** 2
+        waiting, most = part[-1], 0.0
+        for number in reversed(range(len(self.own))):
+            most = max(most, waiting + 3 * whole[number])
+            waiting += sum(part[list(self.tree.nodes[number].children)]) - part[number]
+        return float(most)
 
     def bytes_of_factors(self) -> int:
         """Return what all factors take."""

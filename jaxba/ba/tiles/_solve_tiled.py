@@ -1,30 +1,23 @@
 """`solve_tiled`: the adjustment of `solve`, tile by tile, in as much memory as it is given."""
 
 import os
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._descend import walk
-from jaxba.ba._plan_shape import bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import require_stops
 from jaxba.ba._solvers import SchurLevenbergMarquardt
 from jaxba.ba._system import centred, from_centred, is_traced, own_unknowns
 from jaxba.ba.checks import prepare
-from jaxba.ba.tiles._budget import memory_limit, plan_memory
-from jaxba.ba.tiles._dissect import dissect
-from jaxba.ba.tiles._engine import Engine
-from jaxba.ba.tiles._fronts import Fronts
-from jaxba.geometry import AbstractLoss, Linear, check_loss, require_number
+from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
+from jaxba.geometry import AbstractLoss, Linear, check_loss
 
 
 def solve_tiled(
@@ -32,7 +25,7 @@ def solve_tiled(
     *,
     loss: AbstractLoss | None = None,
     max_memory: float | str | None = None,
-    max_observations: float = 1e5,
+    max_observations: float = TILE_OBSERVATIONS,
     num_tiles: int = 1,
     folder: str | os.PathLike[str] | None = None,
     workers: int | None = None,
@@ -68,29 +61,18 @@ def solve_tiled(
         raise JaxbaError("solve_tiled: the problem is traced, as inside jit, vmap and derivatives; use solve there.")
     max_nfev = require_stops("solve_tiled", max_nfev=max_nfev, ftol=ftol, xtol=xtol, gtol=gtol)
     solver = SchurLevenbergMarquardt(rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
-    require_number("solve_tiled: max_observations", max_observations, 1.0, np.inf, "give a number of observations")
-    require_number("solve_tiled: num_tiles", num_tiles, 1.0, 2.0**31 - 1, "give a whole number, 1 or more", whole=True)
-    cores = os.cpu_count() or 1
-    workers = cores if workers is None else workers
-    require_number("solve_tiled: workers", workers, 1.0, 1024.0, "give a whole number, 1 or more", whole=True)
-    limit = memory_limit(max_memory)
 
     prepared = prepare(problem)
     problem = prepared.problem
     near, origin = centred(problem)
-    shape = bare_shape(near)
-    with (
-        jax.enable_x64(True),
-        threadpool_limits(cores, user_api="blas"),  # sums depend on how many, so it is not the number of workers
-        tempfile.TemporaryDirectory(prefix="jaxba-", dir=folder) as files,
-    ):
-        tree = dissect(
-            near, block=shape.block, border=shape.border, max_observations=max_observations, num_tiles=int(num_tiles)
-        )
-        fronts = Fronts(tree, shape.block, shape.border)
-        of_tiles = np.bincount(tree.tile_of_point[np.asarray(near.observations.point_index)])
-        budget = plan_memory(near, fronts, limit, float(of_tiles.max()), int(workers))
-        engine = Engine(near, loss, tree, fronts, budget, Path(files), int(workers))
+    room: dict[str, Any] = {
+        "max_memory": max_memory,
+        "max_observations": max_observations,
+        "num_tiles": num_tiles,
+        "folder": folder,
+        "workers": workers,
+    }
+    with opened("solve_tiled", near, loss, **room) as engine:
         start = own_unknowns(near)
         set_up = time.perf_counter()
         engine.compile(start)

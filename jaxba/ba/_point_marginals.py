@@ -1,0 +1,118 @@
+"""Marginals of points: the compiled part of `_covariance.py`.
+
+With V = L L^T the block of a point and Z_i = L^-1 W_i as in `_schur.py`, and S^-1 the inverse of the reduced system,
+over images and the border of shared unknowns,
+
+    cov_x = V^-1 + V^-1 W^T S^-1 W V^-1 = L^-T (I + sum over its observations i, j of  Z_i S^-1_ij Z_j^T) L^-1
+
+in which the border counts as one more block. So of S^-1 no more is needed than its blocks where the reduced system has
+some itself. Points are summed over runs of pairs of observations.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.ba._linearise import Linearisation
+from jaxba.ba._plan import ROW_RUN
+from jaxba.ba._priors import robust_rows
+from jaxba.ba._rows import rows_of
+from jaxba.ba._schur import apply_root, eliminate
+from jaxba.ba._solvers import damped_points
+from jaxba.ba._system import System
+from jaxba.ba._unknowns import Unknowns
+
+_CHUNK = 4096  # rows summed at a time
+
+
+class InverseBlocks(NamedTuple):
+    """The inverse of the reduced system where the system itself has blocks; images in the solver's order.
+
+    - `off_diagonal`: of the images `System.block_row` and `block_column`.
+    - `border`: between images and border. `corner`: of the border.
+    """
+
+    diagonal: Float[Array | np.ndarray, "images block block"]
+    off_diagonal: Float[Array | np.ndarray, "blocks block block"]
+    border: Float[Array | np.ndarray, "images block border"]
+    corner: Float[Array | np.ndarray, "border border"]
+
+
+class Squares(NamedTuple):
+    """Squares of residuals over their sigmas, a group's rows: summed over components that depend on something free."""
+
+    squared: Float[Array | np.ndarray, " rows"]
+    components: Int[Array | np.ndarray, " rows"]
+
+
+def point_marginals(
+    system: System, model: Linearisation, inverse: InverseBlocks, damping: Float[Array, ""]
+) -> Float[Array, "points 3 3"]:
+    """Return the points' covariances; zero for what is fixed.
+
+    - `damping`: of the points' blocks, as in a step.
+    """
+    shape = system.shape
+    damped, of_points = damped_points(model, damping)
+    eliminated = eliminate(damped, of_points + (1 - system.free.points))
+    point = jnp.asarray(system.reprojection.point_index).reshape(-1)
+    image = jnp.repeat(jnp.asarray(system.reprojection.run_image), ROW_RUN)
+    z = apply_root(rows_of(eliminated.root, point), eliminated.w)
+    z_shared = apply_root(eliminated.root, eliminated.shared)
+    num_shared = z_shared.shape[-1]
+    cross, corner = inverse.border[:, :, :num_shared], inverse.corner[:num_shared, :num_shared]  # none sees a lever arm
+    total = jnp.zeros((shape.num_points, 3, 3), z.dtype)
+
+    def add_pairs(total: Array, pairs: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        first, second, block = pairs
+        between = rows_of(inverse.off_diagonal, block)
+        product = jnp.einsum("rnij,rjk,rnlk->rnil", rows_of(z, first), between, rows_of(z, second))
+        return total.at[rows_of(point, first).reshape(-1)].add(product.reshape(-1, 3, 3)), None
+
+    def add_own(carry: tuple[Array, Array], rows: Array) -> tuple[tuple[Array, Array], None]:
+        total, through = carry
+        own, seen, at = rows_of(z, rows), rows_of(image, rows), rows_of(point, rows)
+        product = jnp.einsum("nij,njk,nlk->nil", own, rows_of(inverse.diagonal, seen), own)
+        to_border = jnp.einsum("nij,njk->nik", own, rows_of(cross, seen))
+        return (total.at[at].add(product), through.at[at].add(to_border)), None
+
+    if shape.num_blocks:
+        first, second = jnp.asarray(system.pair_first), jnp.asarray(system.pair_second)
+        block = jnp.asarray(system.pair_block).reshape(first.shape[:2])
+        total, _ = jax.lax.scan(add_pairs, total, (first, second, block))
+    last = shape.num_rows - 1  # padding, of weight zero
+    rows = jnp.arange(shape.num_rows, dtype=jnp.int32)
+    rows = jnp.pad(rows, (0, -rows.size % _CHUNK), constant_values=last).reshape(-1, _CHUNK)
+    start = total + jnp.swapaxes(total, 1, 2), jnp.zeros_like(z_shared)
+    (total, through), _ = jax.lax.scan(add_own, start, rows)
+    mixed = jnp.einsum("nik,njk->nij", through, z_shared)
+    total += mixed + jnp.swapaxes(mixed, 1, 2)
+    total += jnp.einsum("nik,kl,njl->nij", z_shared, corner, z_shared)
+    lower = np.tril_indices(3)
+    root = jnp.zeros((shape.num_points, 3, 3), z.dtype).at[:, lower[0], lower[1]].set(eliminated.root)
+    covariances = jnp.einsum("nki,nkl,nlj->nij", root, jnp.eye(3, dtype=z.dtype) + total, root)
+    return covariances * system.free.points[:, :1, None]
+
+
+def squares(system: System, unknowns: Unknowns) -> tuple[Squares, ...]:
+    """Return the squares of the reprojections' residuals, then of each prior's."""
+    group, free = system.reprojection, system.free
+    of_image = free.poses[:, 0] + jnp.sum(rows_of(free.intrinsics, group.camera_index), axis=1)
+    anything = rows_of(of_image, group.run_image)[:, None] + rows_of(free.points[:, 0], group.point_index)
+    depends = (anything > 0) & (jnp.asarray(group.weight) > 0)
+    groups = [(group.residual(unknowns)[0], jnp.stack([depends, depends]))]
+    for prior in system.priors:
+        residual, rows = prior.residual(unknowns), robust_rows(system, prior, unknowns, jnp.zeros(()))
+        depends = jnp.zeros(residual.shape, bool)
+        blocks = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
+        for derivative in [*blocks, *([] if rows.lever_arm is None else [rows.lever_arm])]:
+            depends |= jnp.any(derivative != 0, axis=1)
+        groups.append((residual, depends))
+    return tuple(
+        Squares(jnp.sum(jnp.where(on, r, 0.0) ** 2, axis=0).reshape(-1), jnp.sum(on, axis=0).reshape(-1))
+        for r, on in groups
+    )

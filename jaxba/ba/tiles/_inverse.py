@@ -1,0 +1,162 @@
+"""The marginals of a block: the diagonal blocks of (J^T J)^-1, tile by tile.
+
+Up, everything but the border is eliminated as for a step (`_engine.py`), undamped. Down, each node gets the inverse
+over its own images, its boundary and the border from that of its parent (`_fronts.py`), and each tile the covariances
+of its points from the blocks of the inverse that its own images have in common (`_point_marginals.py`). The inverse of
+the whole is nowhere: of a node's part its children's parts are taken, and it goes.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.ba._compiler import call_compiled
+from jaxba.ba._linearise import Linearisation
+from jaxba.ba._point_marginals import InverseBlocks, Squares, point_marginals, squares
+from jaxba.ba._system import System
+from jaxba.ba._unknowns import Unknowns
+from jaxba.ba.tiles._dense import NotPositive
+from jaxba.ba.tiles._engine import Call, Engine
+
+
+class Marginals(NamedTuple):
+    """Covariances in the problem's order.
+
+    - `blocks`: of images. `border`: joint, of the shared unknowns.
+    - `block_inflation`, `border_inflation`: each variance over what it were if all other unknowns were known.
+    - `squares`: of the reprojections and the priors, by tiles.
+    """
+
+    blocks: Float[np.ndarray, "images block block"]
+    border: Float[np.ndarray, "border border"]
+    points: Float[np.ndarray, "points 3 3"]
+    block_inflation: Float[np.ndarray, "images block"]
+    border_inflation: Float[np.ndarray, " border"]
+    squares: tuple[Squares, ...]
+
+
+class _OfTile(NamedTuple):
+    number: int
+    blocks: Float[np.ndarray, "images block block"]
+    """Of the images in the tile's order; right for those that are eliminated in it."""
+    points: Float[np.ndarray, "points 3 3"]
+    squares: tuple[Squares, ...]
+
+
+def compile_marginals(engine: Engine, unknowns: Unknowns) -> None:
+    """Compile what `marginals` calls, side by side; without it that happens when it is called."""
+
+    def calls(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
+        shape = system.shape
+        images = shape.num_images, shape.block
+        inverse = InverseBlocks(
+            np.zeros((*images, shape.block)),
+            np.zeros((shape.num_blocks, shape.block, shape.block)),
+            np.zeros((*images, shape.border)),
+            np.zeros((shape.border, shape.border)),
+        )
+        return [Call(point_marginals, (system, model, inverse, np.zeros(()))), Call(squares, (system, part))]
+
+    engine.compile(unknowns, calls)
+
+
+def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0) -> Marginals:
+    """Return the marginals at some unknowns.
+
+    - `damping`: that every diagonal is raised by, as a share of it.
+
+    Raises `NotPositive` where the equations have no inverse.
+    """
+    shape, tree, fronts = engine.shape, engine.tree, engine.fronts
+    up = engine.up(unknowns, np.array(damping), np.zeros(()))
+    corner = _inverse(up.update[: shape.border, : shape.border])
+    tail = np.zeros((fronts.tail * shape.block,) * 2)
+    tail[: shape.border, : shape.border] = corner
+    blocks = np.zeros((len(tree.rank), shape.block, shape.block))
+
+    def descend() -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the tiles with the inverse over their boundary and the tail; fill in what lies above them."""
+        of_rest = {len(tree.nodes) - 1: tail}
+        for number in reversed(engine.tops):
+            rest = of_rest.pop(number)
+            if number in engine.tile_of_node:
+                yield engine.tile_of_node[number], rest
+                continue
+            whole = fronts.inverse(engine.factor(number), rest, engine.pool)
+            node = tree.nodes[number]
+            blocks[node.eliminated] = fronts.diagonal_blocks(whole)[: len(node.eliminated)]
+            of_rest |= {child: fronts.of_child(child, whole) for child in node.children}
+            if whole is not rest:
+                fronts.memory.give_back(whole)
+
+    def of_tile(number: int, rest: np.ndarray) -> _OfTile:
+        return _of_tile(engine, unknowns, number, rest, corner, damping)
+
+    points = np.zeros((len(tree.tile_of_point), 3, 3))
+    parts: list[tuple[Squares, ...]] = [()] * len(engine.tiles)
+    for found in engine.each_tile(of_tile, descend()):
+        tile, _ = engine.tiles[found.number]
+        own = tree.node_of_image[tile.order] <= tree.tiles[found.number]
+        blocks[tile.order[own]] = found.blocks[own]
+        points[tile.points[tile.plan.point_order]] = found.points
+        parts[found.number] = found.squares
+    groups = [Squares(*map(np.concatenate, zip(*group, strict=True))) for group in zip(*parts, strict=True)]
+    return Marginals(
+        blocks,
+        corner,
+        points,
+        np.diagonal(blocks, axis1=1, axis2=2) * up.diagonal,
+        np.diagonal(corner) * up.border_diagonal,
+        tuple(groups),
+    )
+
+
+def _of_tile(
+    engine: Engine, unknowns: Unknowns, number: int, rest: np.ndarray, corner: np.ndarray, damping: float
+) -> _OfTile:
+    shape, fronts = engine.shape, engine.fronts
+    tile, of_tile = engine.tiles[number]
+    plan = tile.plan.shape
+    images = np.zeros((plan.num_images, shape.block, shape.block))
+    pairs = np.zeros((plan.num_blocks, shape.block, shape.block))
+    border = np.zeros((plan.num_images, shape.block, shape.border))
+    of_rest = {of_tile.last: rest}
+    for node in reversed(range(of_tile.first, of_tile.last + 1)):
+        rest = of_rest.pop(node)
+        whole = fronts.inverse(engine.factor(node), rest)
+        part = of_tile.parts[node - of_tile.first]
+        fronts.take_blocks(node, whole, part, pairs)
+        images[part.images] = fronts.diagonal_blocks(whole)[part.place]
+        by_image = whole.reshape(-1, shape.block, len(whole))[part.place]
+        end = len(whole) - fronts.tail * shape.block
+        border[part.images] = by_image[:, :, end : end + shape.border]
+        of_rest |= {child: fronts.of_child(child, whole) for child in engine.tree.nodes[node].children}
+        if whole is not rest:
+            fronts.memory.give_back(whole)
+    system, own = engine.system(number), tile.take(unknowns)
+    model = engine.equations(number, own, np.zeros(()))
+    inverse = InverseBlocks(images, pairs, border, corner)
+    points = call_compiled(point_marginals, system, model, inverse, np.array(damping))
+    found = jax.tree.map(np.asarray, call_compiled(squares, system, own))
+    count = len(tile.order)
+    return _OfTile(number, images[:count], np.asarray(points)[: len(tile.points)], found)
+
+
+def _inverse(corner: Float[np.ndarray, "border border"]) -> Float[np.ndarray, "border border"]:
+    """Return the inverse of a symmetric matrix, of which the lower triangle is read, scaled to a diagonal of ones.
+
+    Raises `NotPositive`.
+    """
+    scale = np.diagonal(corner)
+    if not np.all(scale > 0):
+        raise NotPositive
+    scale = 1 / np.sqrt(scale)
+    try:
+        root = np.linalg.cholesky(corner * scale[:, None] * scale)  # numpy reads the lower triangle alone
+    except np.linalg.LinAlgError as error:
+        raise NotPositive from error
+    half = np.linalg.solve(root, np.diag(scale))
+    return half.T @ half

@@ -7,7 +7,7 @@ are apart. jax's persistent cache, where it is switched on, keeps the result acr
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -85,16 +85,25 @@ def walk(
     step: Callable[[Unknowns, State], tuple[Unknowns, State]],
     max_nfev: int,
     callback: Callable[[HistoryStep], None] | None = None,
+    *,
+    before: Sequence[HistoryStep] = (),
+    save: Callable[[Unknowns, State, list[HistoryStep]], None] | None = None,
 ) -> tuple[Unknowns, State, list[HistoryStep], bool]:
-    """Step as `descend` does; return where it stopped, what it tried, and whether Ctrl-C ended it."""
-    begun = time.perf_counter()
-    history = [HistoryStep(step=0, seconds=0.0, cost=float(state.cost), accepted=True, trust=float(state.trust))]
+    """Step as `descend` does; return where it stopped, what it tried, and whether Ctrl-C ended it.
+
+    - `before`: what an earlier call tried, if this one goes on from there. `save`: called after each step.
+    """
+    begun = time.perf_counter() - (before[-1].seconds if before else 0.0)
+    first = HistoryStep(step=0, seconds=0.0, cost=float(state.cost), accepted=True, trust=float(state.trust))
+    history = list(before) or [first]
     interrupted = False
     try:
         while int(state.status) == RUNNING and len(history) <= max_nfev:
             reached = step(unknowns, state)
             entry = _history_step(len(history), begun, jax.device_get(reached[1]))
             (unknowns, state), _ = reached, history.append(entry)
+            if save is not None:
+                save(unknowns, state, history)
             if callback is not None:
                 callback(history[-1])
     except KeyboardInterrupt:

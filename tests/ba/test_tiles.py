@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import functools
 from collections.abc import Callable
+from pathlib import Path
 from typing import ClassVar
 
 import equinox as eqx
@@ -264,6 +265,51 @@ def test_a_full_disk_names_the_folder_and_the_cure(tmp_path: object, monkeypatch
     monkeypatch.setattr(_shelf.np, "save", full)
     with pytest.raises(JaxbaError, match=f"{tmp_path}.*No space left on device.*free there.*max_memory"):
         jaxba.solve_tiled(_everything(), num_tiles=4, folder=str(tmp_path))
+
+
+def test_a_lost_file_of_a_tile_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jaxba.ba.tiles._opened.plan_memory", lambda *_: Budget(0.0, 0.0, 0.0))
+
+    def remove(_: object) -> None:
+        for file in tmp_path.glob("jaxba-*/system-2-*.npy"):
+            file.unlink()
+
+    with pytest.raises(JaxbaError, match=r"jaxba-.*is gone or damaged .*system-2-.*Give a folder of your own"):
+        jaxba.solve_tiled(_everything(), loss=Huber(1.0), num_tiles=4, folder=tmp_path, max_nfev=3, callback=remove)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_second_call_goes_on_from_the_checkpoint_to_the_same_bytes(tmp_path: Path) -> None:
+    # breaks where anything that decides on a step is not kept
+    problem, path = _everything(), tmp_path / "standing"
+    options = {"loss": Huber(1.0), "num_tiles": 4, "max_nfev": 6}
+    once = jaxba.solve_tiled(problem, **options)
+
+    def stop(step: jaxba.ba.HistoryStep) -> None:
+        if step.step in (2, 3):
+            raise KeyboardInterrupt
+
+    for steps in (2, 3):
+        broken = jaxba.solve_tiled(problem, **options, checkpoint=path, callback=stop)
+        assert broken.result == "interrupted" and broken.num_steps == steps
+        assert [file.name for file in tmp_path.iterdir()] == ["standing"]
+    with pytest.raises(JaxbaError, match=r"standing: is the checkpoint of another problem or loss; remove it"):
+        jaxba.solve_tiled(problem, loss=Huber(2.0), checkpoint=path)
+    whole = jaxba.solve_tiled(problem, **options, checkpoint=path)
+    values, others = (jax.tree.leaves(dataclasses.replace(solution, report=None)) for solution in (once, whole))
+    for value, same in zip(values, others, strict=True):
+        np.testing.assert_array_equal(value, same)
+    costs = [[dataclasses.replace(step, seconds=0.0) for step in of.report.history] for of in (once, whole)]
+    assert costs[0] == costs[1]
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"PK no archive", b"text"])
+def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "standing"
+    path.write_bytes(content)
+    with pytest.raises(JaxbaError, match=r"standing: is no checkpoint that can be read .*remove it to begin anew"):
+        jaxba.solve_tiled(_everything(), checkpoint=path)
 
 
 @pytest.mark.parametrize(

@@ -43,13 +43,22 @@ class Shelf:
         return fits
 
     def get(self, key: Hashable) -> Any:
-        """Return a tree, or None."""
+        """Return a tree, or None.
+
+        Raises `JaxbaError` where its files are gone.
+        """
         if key in self._kept:
             return self._kept[key]
         if key not in self._filed:
             return None
         structure, paths = self._filed[key]
-        return jax.tree.unflatten(structure, [np.load(path) for path in paths])
+        try:
+            return jax.tree.unflatten(structure, [np.load(path) for path in paths])
+        except (OSError, ValueError, EOFError) as error:
+            raise JaxbaError(
+                f"{paths[0].parent}: a file of a tile that was written there is gone or damaged ({error}); something "
+                "else removes files there. Give a folder of your own (folder)."
+            ) from error
 
     def release(self, key: Hashable) -> Any:
         """Return a tree that lies in memory and keep it no longer; None for one that does not."""

@@ -16,6 +16,7 @@ from jaxba.ba._solve import require_stops
 from jaxba.ba._solvers import SchurLevenbergMarquardt
 from jaxba.ba._system import centred, from_centred, is_traced, own_unknowns
 from jaxba.ba.checks import prepare
+from jaxba.ba.tiles._checkpoint import Checkpoint, Standing
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
@@ -29,6 +30,7 @@ def solve_tiled(
     num_tiles: int = 1,
     folder: str | os.PathLike[str] | None = None,
     workers: int | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     max_nfev: int = 500,
     ftol: float = 1e-8,
     xtol: float = 1e-8,
@@ -45,6 +47,8 @@ def solve_tiled(
     - `max_observations`: of a tile. `num_tiles`: at least so many tiles.
     - `folder`: for these files; the system's own for such files if None. They are gone at the end.
     - `workers`: tiles that are worked on at a time; as many as there are cores if None. It does not change the result.
+    - `checkpoint`: a file that holds where the solve stands after each step. A call that finds it goes on from there,
+      to the same bytes as without a break; it is gone when the solve has ended by itself.
 
     Raises `JaxbaError` as `solve` does, and where memory or disk do not suffice. It works on concrete values only.
 
@@ -62,6 +66,8 @@ def solve_tiled(
     max_nfev = require_stops("solve_tiled", max_nfev=max_nfev, ftol=ftol, xtol=xtol, gtol=gtol)
     solver = SchurLevenbergMarquardt(rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
 
+    kept = None if checkpoint is None else Checkpoint(checkpoint, problem, loss)
+    standing = None if kept is None else kept.load()
     prepared = prepare(problem)
     problem = prepared.problem
     near, origin = centred(problem)
@@ -78,10 +84,19 @@ def solve_tiled(
         engine.compile(start)
         compiled = time.perf_counter()
         costs = engine.costs(start)
-        state = solver.state_of(jnp.asarray(costs[0]))
+        if standing is None:
+            standing = Standing(start, solver.state_of(jnp.asarray(costs[0])), ())
         found, state, history, interrupted = walk(
-            start, state, lambda unknowns, state: engine.step(solver, unknowns, state), max_nfev, callback
+            standing.unknowns,
+            standing.state,
+            lambda unknowns, state: engine.step(solver, unknowns, state),
+            max_nfev,
+            callback,
+            before=standing.history,
+            save=None if kept is None else kept.save,
         )
+        if kept is not None and not interrupted:
+            kept.remove()
         costs = (costs[0], state.cost, costs[1], engine.costs(found)[1])
     report = Report(
         history=tuple(history),

@@ -25,7 +25,8 @@ from jaxba.ba.groups import (
     LeverArmPrior,
     PositionPrior,
 )
-from jaxba.ba.tiles import solve_batch, solve_tiled
+from jaxba.ba.tiles._batch import solve_batch
+from jaxba.ba.tiles._solve_tiled import solve_tiled
 
 __all__ = [
     "PRIORS",

@@ -20,7 +20,7 @@ from jaxba.ba._descend import descend
 from jaxba.ba._plan import LinearSolver, Plan
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
-from jaxba.ba._solvers import AbstractSchurSolver, SchurDogleg, SchurLevenbergMarquardt, require_tolerance
+from jaxba.ba._solvers import AbstractSchurSolver, SchurDogleg, SchurLevenbergMarquardt, require_stops
 from jaxba.ba._system import (
     System,
     centred,
@@ -34,13 +34,16 @@ from jaxba.ba._system import (
 from jaxba.ba._traced import solve_traced
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.checks import Prepared
-from jaxba.geometry import AbstractLoss, Linear, check_loss, require_number
+from jaxba.ba.tiles._solve_tiled import in_tiles
+from jaxba.geometry import AbstractLoss, Linear, check_loss
 
 Method = Literal["lm", "dogleg"]
 SOLVERS: dict[str, type[SchurLevenbergMarquardt] | type[SchurDogleg]] = {
     "lm": SchurLevenbergMarquardt,
     "dogleg": SchurDogleg,
 }
+
+_TILES_FROM = 1000  # images
 
 
 def solve(
@@ -62,7 +65,8 @@ def solve(
 
     - `loss`: robust loss of the reprojections, in units of their sigma; least squares if None. Priors carry their own.
     - `method`: `lm`, Levenberg-Marquardt, or `dogleg`.
-    - `linear_solver`: how the reduced system is solved; `auto` chooses from its size and bandwidth.
+    - `linear_solver`: how the reduced system is solved; `auto` chooses from its size and bandwidth, and solves large
+      blocks by `solve_tiled`, which reaches the same solution faster, and in the memory that is free.
     - `max_nfev`: the most steps tried. `ftol`: stop when the cost changes by less than this share. `xtol`: when all
       unknowns together move what the images see by less than so many radians. `gtol`: when no entry of the gradient is
       larger, as in scipy.
@@ -97,21 +101,13 @@ def solve(
     solver = SOLVERS[method](rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
     if is_traced((problem, loss)):
         return solve_traced(problem, loss, solver, plan, linear_solver, adjoint, max_nfev, callback)
+    usual = linear_solver == "auto" and plan is None and _name_of(dtype) == "float64"
+    if usual and isinstance(solver, SchurLevenbergMarquardt) and problem.num_images >= _TILES_FROM:
+        return in_tiles("solve", problem, loss, solver, max_nfev, callback, None, {})
     # OpenBLAS's threads fight with XLA's for the cores (with them a 144 x 144 Cholesky took 204 ms instead of 0.16 ms),
     # so OpenBLAS gets one thread for as long as this runs
     with jax.enable_x64(True), threadpool_limits(1, user_api="blas"):
         return _solve_on_host(problem, loss, solver, plan, linear_solver, max_nfev, dtype, callback)
-
-
-def require_stops(label: str, *, max_nfev: int, ftol: float, xtol: float, gtol: float) -> int:
-    """Return `max_nfev` as a number; raise `JaxbaError` for what is no limit or tolerance of a solve."""
-    if is_traced((ftol, xtol, gtol, max_nfev)):
-        raise JaxbaError(f"{label}: ftol, xtol, gtol or max_nfev is traced, as arguments of jit are; give numbers.")
-    cure = "give a whole number of steps, 1 or more"
-    require_number(f"{label}: max_nfev", max_nfev, 1.0, 2.0**31 - 1, cure, whole=True)
-    for name, value in (("ftol", ftol), ("xtol", xtol), ("gtol", gtol)):
-        require_tolerance(f"{label}: {name}", value)
-    return int(max_nfev)
 
 
 def _name_of(dtype: Any) -> str:

@@ -21,6 +21,7 @@ import optimistix as optx
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxba._errors import JaxbaError
 from jaxba.ba._factor import solve_reduced
 from jaxba.ba._lengths import (
     all_squared_in_sigmas,
@@ -34,7 +35,7 @@ from jaxba.ba._lengths import (
 from jaxba.ba._linearise import Linearisation, cost, curvature, linearise
 from jaxba.ba._refine import move_points, refine_points
 from jaxba.ba._schur import ReducedVector, back_substitute, eliminate_points, one_for_fixed, reduce_vector, to_reduced
-from jaxba.ba._system import System
+from jaxba.ba._system import System, is_traced
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.geometry import require_number
 
@@ -100,6 +101,17 @@ class Tried(NamedTuple):
 def require_tolerance(label: str, value: Any) -> None:
     """Raise `JaxbaError` for a tolerance that is negative or not finite."""
     require_number(label, value, 0.0, np.finfo(float).max, "give 0 (never stop for it) or a small positive number")
+
+
+def require_stops(label: str, *, max_nfev: int, ftol: float, xtol: float, gtol: float) -> int:
+    """Return `max_nfev` as a number; raise `JaxbaError` for what is no limit or tolerance of a solve."""
+    if is_traced((ftol, xtol, gtol, max_nfev)):
+        raise JaxbaError(f"{label}: ftol, xtol, gtol or max_nfev is traced, as arguments of jit are; give numbers.")
+    cure = "give a whole number of steps, 1 or more"
+    require_number(f"{label}: max_nfev", max_nfev, 1.0, 2.0**31 - 1, cure, whole=True)
+    for name, value in (("ftol", ftol), ("xtol", xtol), ("gtol", gtol)):
+        require_tolerance(f"{label}: {name}", value)
+    return int(max_nfev)
 
 
 def residuals(unknowns: Unknowns, system: System) -> tuple[Float[Array, "components *rows"], ...]:

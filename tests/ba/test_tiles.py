@@ -215,6 +215,18 @@ def test_steps_and_solution_are_those_of_the_block_in_one_piece(kind: str, num_t
         assert tiled.cameras.k1 == -0.03  # the bound is active
 
 
+def test_solve_takes_the_tree_for_large_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    # breaks where solve leaves out the loss, the stops or the callback on its way there, or goes there against options
+    problem, loss, costs = _KINDS["everything"][0](), _KINDS["everything"][1], []
+    monkeypatch.setattr("jaxba.ba._solve._TILES_FROM", 60)
+    solution = jaxba.solve(problem, loss=loss, max_nfev=2, callback=lambda step: costs.append(step.cost))
+    monkeypatch.undo()
+    assert solution.report is not None and solution.report.linear_solver == "tiles"
+    once = jaxba.solve(problem, loss=loss, max_nfev=2)
+    assert once.report is not None and once.report.linear_solver == "dense"
+    np.testing.assert_allclose(costs, [step.cost for step in once.report.history[1:]], rtol=1e-9)
+
+
 class _Level(AbstractPrior):
     """Cameras of some images stand at a height, with no field for a sigma."""
 

@@ -22,7 +22,8 @@ from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._plan_shape import alike, larger
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import Solution
-from jaxba.ba._solve import SOLVERS, Method, require_stops, solve, solve_prepared
+from jaxba.ba._solve import SOLVERS, Method, solve, solve_prepared
+from jaxba.ba._solvers import require_stops
 from jaxba.ba._system import is_traced
 from jaxba.ba.checks import Prepared, prepare
 from jaxba.geometry import AbstractLoss, Linear, check_loss, require_number

@@ -12,8 +12,7 @@ from jaxba._errors import JaxbaError
 from jaxba.ba._descend import walk
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
-from jaxba.ba._solve import require_stops
-from jaxba.ba._solvers import SchurLevenbergMarquardt
+from jaxba.ba._solvers import SchurLevenbergMarquardt, require_stops
 from jaxba.ba._system import centred, from_centred, is_traced, own_unknowns
 from jaxba.ba.checks import prepare
 from jaxba.ba.tiles._checkpoint import Checkpoint, Standing
@@ -58,7 +57,6 @@ def solve_tiled(
     >>> bool(abs(whole.final_cost - tiled.final_cost) < 1e-9 * whole.final_cost)
     True
     """
-    begun = time.perf_counter()
     loss = Linear() if loss is None else loss
     check_loss("solve_tiled: loss", loss)
     if is_traced((problem, loss)):
@@ -66,11 +64,6 @@ def solve_tiled(
     max_nfev = require_stops("solve_tiled", max_nfev=max_nfev, ftol=ftol, xtol=xtol, gtol=gtol)
     solver = SchurLevenbergMarquardt(rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
 
-    kept = None if checkpoint is None else Checkpoint(checkpoint, problem, loss)
-    standing = None if kept is None else kept.load()
-    prepared = prepare(problem)
-    problem = prepared.problem
-    near, origin = centred(problem)
     room: dict[str, Any] = {
         "max_memory": max_memory,
         "max_observations": max_observations,
@@ -78,7 +71,27 @@ def solve_tiled(
         "folder": folder,
         "workers": workers,
     }
-    with opened("solve_tiled", near, loss, **room) as engine:
+    return in_tiles("solve_tiled", problem, loss, solver, max_nfev, callback, checkpoint, room)
+
+
+def in_tiles(
+    label: str,
+    problem: Problem,
+    loss: AbstractLoss,
+    solver: SchurLevenbergMarquardt,
+    max_nfev: int,
+    callback: Callable[[HistoryStep], None] | None,
+    checkpoint: str | os.PathLike[str] | None,
+    room: dict[str, Any],
+) -> Solution:
+    """Return the solution, for the function named `label`; `room` are options of `opened`."""
+    begun = time.perf_counter()
+    kept = None if checkpoint is None else Checkpoint(checkpoint, problem, loss)
+    standing = None if kept is None else kept.load()
+    prepared = prepare(problem)
+    problem = prepared.problem
+    near, origin = centred(problem)
+    with opened(label, near, loss, **room) as engine:
         start = own_unknowns(near)
         set_up = time.perf_counter()
         engine.compile(start)

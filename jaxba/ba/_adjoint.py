@@ -40,10 +40,10 @@ from jaxba.geometry import Linear
 
 Adjoint = Literal["implicit", "gauss_newton", "unrolled"]
 
-_ON_BOUND = 1e-12
+ON_BOUND = 1e-12
 _SETTLED, _MOST_ROUNDS = 1e-10, 3
-_SINGULAR = 1e-13  # pivot over what it was before anything was eliminated
-_NOT_A_MINIMUM = (
+SINGULAR = 1e-13  # pivot over what it was before anything was eliminated
+NOT_A_MINIMUM = (
     "Derivatives: the values reached are no isolated minimum, so they have none. Either nothing fixes the block or a "
     "part of it (jaxba.free_gauge(problem) names the directions: add a position prior or three control points, or fix "
     "two poses; leave out points seen once, as solution.report.problem does), or the solver stopped before it "
@@ -97,14 +97,14 @@ def _optimum_jvp(
     try:
         near, equations = _at_the_optimum(*jax.lax.stop_gradient((system, found.unknowns)), exact)
         unknowns = jax.tree.map(lambda a, b: a + jax.lax.stop_gradient(b - a), found.unknowns, near)
-        _tell_held(jnp.sum(system.free.points[:, 0]), jnp.sum(equations.system.free.points[:, 0]))
+        tell_held(jnp.sum(system.free.points[:, 0]), jnp.sum(equations.system.free.points[:, 0]))
         moved = _moved(system, unknowns, equations, system_dot, start_dot)
     except eqx.EquinoxRuntimeError as error:
-        raise JaxbaError(_NOT_A_MINIMUM) from error
+        raise JaxbaError(NOT_A_MINIMUM) from error
     return found, Found(moved, None, None)  # pyright: ignore[reportArgumentType]
 
 
-def _tell_held(free: Array, left: Array) -> None:
+def tell_held(free: Array, left: Array) -> None:
     """Warn of points that were held, also from inside a jit."""
 
     def tell(free: Any, left: Any) -> None:
@@ -127,7 +127,7 @@ def gradient(system: System, unknowns: Unknowns) -> Step:
 def polish(system: System, unknowns: Unknowns) -> Unknowns:
     """Return the unknowns after a Newton step; as they are where the cost would rise."""
     if not isinstance(system.loss, Linear):
-        unknowns = _call(_settled, system, unknowns)
+        unknowns = _call(settled, system, unknowns)
     return _call(_newton, _call(_exact_equations, system, unknowns), unknowns)
 
 
@@ -141,7 +141,7 @@ def _call(function: Callable[..., Any], *arguments: Any) -> Any:
     return function(*arguments) if is_traced(arguments) else call_compiled(function, *arguments)
 
 
-def _settled(system: System, unknowns: Unknowns) -> Unknowns:
+def settled(system: System, unknowns: Unknowns) -> Unknowns:
     """Return the unknowns with every point in a minimum of its own.
 
     The solver stops when the whole cost no longer changes; a point with a wrong match may then still be on its way over
@@ -205,18 +205,18 @@ def _equations(system: System, unknowns: Unknowns, exact: bool) -> _Equations:
         slope, free = linearise(system, unknowns).gradient.intrinsics, system.free.intrinsics
         # a step to a bound ends on it but for rounding
         below, above = unknowns.intrinsics - system.lower, system.upper - unknowns.intrinsics
-        near = _ON_BOUND * (1 + jnp.abs(unknowns.intrinsics))
+        near = ON_BOUND * (1 + jnp.abs(unknowns.intrinsics))
         at_lower = jnp.where((below <= near) & (slope > 0), free, 0.0)
         at_upper = jnp.where((above <= near) & (slope < 0), free, 0.0)
         system = eqx.tree_at(lambda s: s.free.intrinsics, system, free * (1 - at_lower) * (1 - at_upper))
     model = assemble(system, unknowns)
     if exact:
-        system, model = _hold_saddles(system, model)
+        system, model = hold_saddles(system, model)
     reduced = eliminate_points(system, model, one_for_fixed(system, jax.tree.map(jnp.zeros_like, system.free)))
     return _Equations(system, model, reduced, factor_reduced(system, reduced), at_lower, at_upper)
 
 
-def _hold_saddles(system: System, model: Linearisation) -> tuple[System, Linearisation]:
+def hold_saddles(system: System, model: Linearisation) -> tuple[System, Linearisation]:
     """Hold points whose own second derivatives are not positive definite."""
     v = model.point_products
     minors = [v[:, 0, 0], v[:, 0, 0] * v[:, 1, 1] - v[:, 0, 1] ** 2, jnp.linalg.det(v)]
@@ -241,7 +241,7 @@ def _moved(system: System, unknowns: Unknowns, equations: _Equations, system_dot
         for bound, dot in ((system.lower, system_dot.lower), (system.upper, system_dot.upper))
     ]
     pivot = smallest_pivot(equations.system, equations.reduced, equations.factored)
-    equations = eqx.error_if(equations, ~(pivot > _SINGULAR), _NOT_A_MINIMUM)
+    equations = eqx.error_if(equations, ~(pivot > SINGULAR), NOT_A_MINIMUM)
     free = equations.system.free
     intrinsics_dot = jnp.where(equations.at_upper > 0, bounds_dot[1], start_dot.intrinsics)
     intrinsics_dot = jnp.where(equations.at_lower > 0, bounds_dot[0], intrinsics_dot)

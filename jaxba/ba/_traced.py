@@ -31,7 +31,7 @@ from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.checks import require_gauge
 from jaxba.geometry import AbstractLoss
 
-_NOT_DOUBLE = (
+NOT_DOUBLE = (
     "Derivatives of solve are computed in double precision: call jax.config.update('jax_enable_x64', True) before "
     "anything else of jax."
 )
@@ -62,7 +62,7 @@ def solve_traced(
 
     def require() -> None:
         if dtype != jnp.float64:
-            raise JaxbaError(_NOT_DOUBLE)
+            raise JaxbaError(NOT_DOUBLE)
         if not is_traced(problem):
             with jax.ensure_compile_time_eval():
                 require_gauge(problem, "Derivatives")

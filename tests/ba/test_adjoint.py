@@ -15,7 +15,7 @@ from small_problems import EVERY_CAMERA, RADIAL, small_problem
 
 import jaxba
 from jaxba import JaxbaError, Problem
-from jaxba.ba._adjoint import _equations, _hold_saddles, _tell_held
+from jaxba.ba._adjoint import _equations, hold_saddles, tell_held
 from jaxba.ba._factor import factor_reduced, solve_factored
 from jaxba.ba._hessian import hessian
 from jaxba.ba._linearise import cost, curvature
@@ -166,7 +166,7 @@ def test_a_point_on_a_saddle_is_held_and_told():
         rhs = fixed.free  # a one for everything that is free
         model = hessian(free, unknowns)
         bent = eqx.tree_at(lambda m: m.point_products, model, model.point_products.at[point, 2, 2].multiply(-1.0))
-        system, held = _hold_saddles(free, bent)
+        system, held = hold_saddles(free, bent)
         reduced = eliminate_points(system, held, one_for_fixed(system, jax.tree.map(jnp.zeros_like, rhs)))
         vector = solve_factored(
             system, reduced, factor_reduced(system, reduced), reduce_vector(system, reduced.points, rhs)
@@ -181,7 +181,7 @@ def test_a_point_on_a_saddle_is_held_and_told():
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
     with pytest.warns(RuntimeWarning, match=r"1 of 20 points rest on a saddle .*solve_and_reject"):
-        _tell_held(jnp.asarray(free.free.points[:, 0].sum()), jnp.asarray(left.points[:, 0].sum()))
+        tell_held(jnp.asarray(free.free.points[:, 0].sum()), jnp.asarray(left.points[:, 0].sum()))
 
 
 @pytest.fixture(scope="module")

@@ -328,7 +328,10 @@ def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path, content: byte
     ("options", "message"),
     [
         ({"max_memory": "lots"}, "max_memory 'lots': give an amount from 100MB such as 4GB"),
-        ({"max_memory": "100MB"}, "are needed: .* for the problem with .* points .* 100.0 MB are allowed; give solve_tiled more"),
+        (
+            {"max_memory": "100MB"},
+            "are needed: .* for the problem with .* points .* 100.0 MB are allowed; give solve_tiled more",
+        ),
         ({"num_tiles": 0}, "num_tiles is 0; give a whole number, 1 or more"),
         ({"max_observations": 0.5}, "max_observations is 0.5; give a number"),
         ({"workers": 0}, "workers is 0; give a whole number"),
@@ -340,10 +343,61 @@ def test_options_out_of_range_are_refused(options: dict[str, object], message: s
         jaxba.solve_tiled(_everything(), **options)
 
 
-def test_a_traced_problem_is_refused() -> None:
-    problem = _everything()
-    with pytest.raises(JaxbaError, match=r"traced.*use solve there"):
-        jax.jit(lambda p: jaxba.solve_tiled(eqx.tree_at(lambda q: q.points, problem, p)).points)(problem.points)
+def _number_of(theta: tuple[Problem, AbstractLoss], **options: object) -> jax.Array:
+    """Return a number that every kind of unknown and the cost have part in."""
+    solution = jaxba.solve_tiled(theta[0], loss=theta[1], num_tiles=4, **options)
+    rng = np.random.default_rng(1)
+    parts = solution.points, solution.poses.translation, solution.cameras.fx, solution.lever_arm
+    return 3 * solution.final_cost + sum(jnp.sum(rng.normal(size=np.shape(part)) * part) for part in parts)
+
+
+_THETA = {
+    "pixels": lambda t: t[0].observations.xy_px,
+    "pixel sigmas": lambda t: t[0].observations.std_px,
+    "sigmas of positions": lambda t: t[0].priors[0].std_m,
+    "active bound": lambda t: t[0].lower,
+    "loss scale": lambda t: t[1].f_scale,
+}
+
+
+def test_the_gradient_is_that_of_central_differences() -> None:
+    # breaks where a tile's part is left out or counts twice, or what a bound holds moves
+    with jax.enable_x64(True):
+        theta = jaxba.ba.prepare(_everything()).problem, Huber(jnp.array(1.0))
+        numbers, rest = eqx.partition(theta, eqx.is_inexact_array)
+        found = jax.grad(lambda n: _number_of(eqx.combine(n, rest), **_TIGHT))(numbers)
+        for name, where in _THETA.items():
+            value, slope = np.asarray(where(theta)), np.asarray(where(found))
+            size = 1.0 if name == "pixels" else np.where(np.isfinite(value), np.maximum(np.abs(value), 1e-2), 0.0)
+            step = 1e-5 * np.sign(slope) * size  # longer ones cross the bend of the loss
+            if name == "active bound":
+                step = np.where(slope != 0, 1e-5, 0.0)
+                assert np.count_nonzero(step) == 1
+            high, low = (float(_number_of(eqx.tree_at(where, theta, value + s), **_TIGHT)) for s in (step, -step))
+            np.testing.assert_allclose(np.sum(slope * step), (high - low) / 2, rtol=3e-4, err_msg=name)
+
+
+def _grad(problem: Problem, cost: str = "final_cost", **options: object) -> None:
+    def of(std_px: jax.Array) -> jax.Array:
+        changed = eqx.tree_at(lambda p: p.observations.std_px, problem, std_px)
+        return getattr(jaxba.solve_tiled(changed, loss=Huber(1.0), num_tiles=4, **options), cost)
+
+    with jax.enable_x64(True):
+        jax.grad(of)(np.asarray(problem.observations.std_px))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: _grad(_everything(), max_nfev=1), "stopped before it converged"),
+        (lambda: _grad(_fixed()), r"report\.problem of a solve before; this one leaves out: .*image"),
+        (lambda: _grad(_everything(), "initial_cost"), "only final_cost has a derivative"),
+        (lambda: jax.jit(lambda p: jaxba.solve_tiled(p).points)(_everything()), "traced, as inside jit and vmap"),
+    ],
+)
+def test_what_has_no_gradient_is_refused(call: Callable[[], None], message: str) -> None:
+    with pytest.raises(JaxbaError, match=message):
+        call()
 
 
 def test_a_front_that_is_not_positive_definite_raises_the_damping(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,11 +29,14 @@ class Tile:
     """A tile: which of the problem's images, cameras and points it holds, and its structure.
 
     - `images`, `cameras`, `points`: in the problem's order. `order`: the images in that of elimination, its solver's.
+    - `rows`, `prior_rows`: its observations, and its rows of each prior.
     """
 
     images: Int[np.ndarray, " images"]
     cameras: Int[np.ndarray, " cameras"]
     points: Int[np.ndarray, " points"]
+    rows: Int[np.ndarray, " rows"]
+    prior_rows: tuple[Int[np.ndarray, " _"], ...]
     order: Int[np.ndarray, " images"]
     plan: Plan
 
@@ -80,7 +83,7 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
         found, cameras = _part(problem, rows, images, points, chosen, own_cameras=shape.own_cameras)
         order = np.argsort(tree.rank[images]).astype(np.int32)
         plan = make_plan(found, linear_solver="dense", like=like, image_order=order)
-        return found, Tile(images, cameras, points, images[order], plan)
+        return found, Tile(images, cameras, points, rows.astype(np.int32), tuple(chosen), images[order], plan)
 
     for group in alike([len(rows) for rows in rows_of_tile], _LIKE):
         like = functools.reduce(larger, (part(number, shape)[1].plan.shape for number in group))

@@ -142,7 +142,7 @@ class Engine:
         """Return the unknowns and the state after a step was tried."""
         damping, bend = np.asarray(state.trust), np.asarray(state.bend)
         try:
-            up = self.up(unknowns, damping, bend)
+            up = self.up(self.step_equations(unknowns, damping, bend), damping)
         except NotPositive:
             return unknowns, call_compiled(_judge_with(solver), state, jax.tree.map(np.asarray, _NOTHING_TRIED))
         trial, sums, squared_norm = self._down(unknowns, self._border(unknowns, up.update), damping, bend)
@@ -176,17 +176,17 @@ class Engine:
         model = self.models.get(number)
         return call_compiled(linearise, self.system(number), part, bend) if model is None else model
 
-    def up(self, unknowns: Unknowns, damping: Float[np.ndarray, ""], bend: Float[np.ndarray, ""]) -> Up:
+    def up(self, hand: Callable[[int], Handed], damping: Float[np.ndarray, ""]) -> Up:
         """Eliminate all but the border, and keep the factors.
 
-        - `damping`, `bend`: see `State`.
+        - `hand`: returns what a tile hands to the fronts. `damping`: see `State`.
 
         Raises `NotPositive` where the damped equations have no factor.
         """
         gradient, squares = (jax.tree.map(np.zeros_like, self.free) for _ in range(2))
         diagonal, of_border = np.zeros((len(self.tree.rank), self.shape.block)), np.zeros(self.shape.border)
         updates: dict[int, np.ndarray] = {}
-        steepest, results = 0.0, self.each_tile(functools.partial(self._up_tile, unknowns, damping, bend))
+        steepest, results = 0.0, self.each_tile(functools.partial(self._up_tile, hand, damping))
         for number in self.tops:
             if number in self.tile_of_node:
                 tile, found = self.tiles[self.tile_of_node[number]][0], next(results)
@@ -208,14 +208,26 @@ class Engine:
         np.einsum("ii->i", top)[: len(on_border)] += on_border
         return Up(top, gradient, squares, steepest, diagonal + images, of_border + on_border)
 
-    def _up_tile(
-        self, unknowns: Unknowns, damping: Float[np.ndarray, ""], bend: Float[np.ndarray, ""], number: int
-    ) -> Up:
+    def step_equations(
+        self, unknowns: Unknowns, damping: Float[np.ndarray, ""], bend: Float[np.ndarray, ""]
+    ) -> Callable[[int], Handed]:
+        """Return the function that gives `up` the equations of a step, and keeps them.
+
+        - `damping`, `bend`: see `State`.
+        """
+
+        def hand(number: int) -> Handed:
+            system = self.system(number)
+            model = call_compiled(linearise, system, self.tiles[number][0].take(unknowns), bend)
+            handed: Handed = jax.tree.map(np.asarray, call_compiled(hand_over, system, model, damping))
+            self.models.put(number, jax.tree.map(np.asarray, model))
+            return handed
+
+        return hand
+
+    def _up_tile(self, hand: Callable[[int], Handed], damping: Float[np.ndarray, ""], number: int) -> Up:
         tile, fronts = self.tiles[number]
-        system = self.system(number)
-        model = call_compiled(linearise, system, tile.take(unknowns), bend)
-        handed: Handed = jax.tree.map(np.asarray, call_compiled(hand_over, system, model, damping))
-        self.models.put(number, jax.tree.map(np.asarray, model))
+        handed = hand(number)
         count = len(tile.order)
         squares, gradient = (
             Step(part.poses[:count], part.intrinsics[: len(tile.cameras)], part.lever_arm, part.points)
@@ -268,12 +280,7 @@ class Engine:
         bend: Float[np.ndarray, ""],
     ) -> tuple[Unknowns, Sums, float]:
         """Return the unknowns after the step, what it is judged by, and its squared length."""
-        solution = np.zeros((len(self.tree.rank), self.shape.block))
-        tail = np.zeros(self.fronts.tail * self.shape.block)
-        tail[: len(border)], tail[len(border)] = border, -1
-        for number in reversed(self.tops):
-            if number not in self.tile_of_node:
-                self.fronts.put_back(number, self.factor(number), solution, tail)
+        solution, tail = self.put_back_tops(border)
         shared = self._shared_step(unknowns, border)
         work = functools.partial(self._down_tile, unknowns, solution, tail, shared, damping, bend)
         trial = Unknowns(
@@ -302,13 +309,10 @@ class Engine:
         bend: Float[np.ndarray, ""],
         number: int,
     ) -> tuple[Unknowns, Sums]:
-        tile, fronts = self.tiles[number]
-        for node in reversed(range(fronts.first, fronts.last + 1)):
-            self.fronts.put_back(node, self.factor(node), solution, tail)
+        tile, _ = self.tiles[number]
+        images = self.put_back_tile(number, solution, tail)
         system, part = self.system(number), tile.take(unknowns)
         model = self.equations(number, part, bend)
-        images = np.zeros((tile.plan.shape.num_images, self.shape.block))
-        images[: len(tile.order)] = solution[tile.order]
         intrinsics = shared.intrinsics
         if self.shape.own_cameras:
             intrinsics = np.zeros(part.intrinsics.shape)
@@ -316,6 +320,29 @@ class Engine:
         step = Step(images[:, :6], intrinsics, shared.lever_arm, np.zeros_like(part.points))
         solved = images, tail[: self.shape.border]
         return jax.tree.map(np.asarray, call_compiled(put_back, system, part, model, *solved, step, damping, bend))
+
+    def put_back_tops(
+        self, border: Float[np.ndarray, " border"]
+    ) -> tuple[Float[np.ndarray, "images block"], Float[np.ndarray, " tail"]]:
+        """Return the images' solution, so far of those above the tiles, and the tail that `put_back_tile` takes."""
+        solution = np.zeros((len(self.tree.rank), self.shape.block))
+        tail = np.zeros(self.fronts.tail * self.shape.block)
+        tail[: len(border)], tail[len(border)] = border, -1
+        for number in reversed(self.tops):
+            if number not in self.tile_of_node:
+                self.fronts.put_back(number, self.factor(number), solution, tail)
+        return solution, tail
+
+    def put_back_tile(
+        self, number: int, solution: Float[np.ndarray, "images block"], tail: Float[np.ndarray, " tail"]
+    ) -> Float[np.ndarray, "padded block"]:
+        """Write the solution of a tile's images into that of all; return the tile's, in its solver's order, padded."""
+        tile, fronts = self.tiles[number]
+        for node in reversed(range(fronts.first, fronts.last + 1)):
+            self.fronts.put_back(node, self.factor(node), solution, tail)
+        images = np.zeros((tile.plan.shape.num_images, self.shape.block))
+        images[: len(tile.order)] = solution[tile.order]
+        return images
 
     def _shared_step(self, unknowns: Unknowns, border: Float[np.ndarray, " border"]) -> Step:
         """Return the border's step of intrinsics and lever arm, within the bounds."""

@@ -65,13 +65,21 @@ def tail_size(block: int, border: int) -> int:
 
 
 def hand_over(system: System, model: Linearisation, damping: Float[Array, ""]) -> Handed:
-    """Return what a tile hands to the fronts; the damping of images and border is added there, once."""
-    shape = system.shape
+    """Return what a tile hands to the fronts for a step; the damping of images and border is added there, once."""
     damped, of_points = damped_points(model, damping)
+    downhill = jax.tree.map(jnp.negative, model.gradient)
+    return handed(system, damped, of_points + (1 - system.free.points), downhill)
+
+
+def handed(system: System, model: Linearisation, of_points: Float[Array | np.ndarray, "points 3"], rhs: Step) -> Handed:
+    """Return what a tile hands to the fronts to solve its equations.
+
+    - `of_points`: what is added to the diagonal of the points. `rhs`: the tile's part of the right-hand side.
+    """
+    shape = system.shape
     zero = jax.tree.map(jnp.zeros_like, model.gradient)
-    unseen = of_points + (1 - system.free.points)
-    reduced = eliminate_points(system, damped, eqx.tree_at(lambda s: s.points, zero, unseen))
-    vector = reduce_vector(system, reduced.points, jax.tree.map(jnp.negative, model.gradient))
+    reduced = eliminate_points(system, model, eqx.tree_at(lambda s: s.points, zero, of_points))
+    vector = reduce_vector(system, reduced.points, rhs)
     pad = tail_size(shape.block, shape.border) * shape.block - shape.border - 1
     tail = jnp.concatenate([reduced.border, vector.images[:, :, None]], axis=2)
     corner = jnp.concatenate([reduced.corner, vector.border[None]])

@@ -8,7 +8,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba._errors import JaxbaError
 from jaxba.ba._descend import walk
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
@@ -17,6 +16,7 @@ from jaxba.ba._system import centred, from_centred, is_traced, own_unknowns
 from jaxba.ba.checks import prepare
 from jaxba.ba.tiles._checkpoint import Checkpoint, Standing
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
+from jaxba.ba.tiles._reverse import solve_reversibly
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
 
@@ -49,7 +49,10 @@ def solve_tiled(
     - `checkpoint`: a file that holds where the solve stands after each step. A call that finds it goes on from there,
       to the same bytes as without a break; it is gone when the solve has ended by itself.
 
-    Raises `JaxbaError` as `solve` does, and where memory or disk do not suffice. It works on concrete values only.
+    Raises `JaxbaError` as `solve` does, and where memory or disk do not suffice.
+
+    `jax.grad` goes through it, tile by tile: the derivative is that of `solve`, in reverse mode alone, and not inside
+    `jit` or `vmap`.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(30)
@@ -59,8 +62,6 @@ def solve_tiled(
     """
     loss = Linear() if loss is None else loss
     check_loss("solve_tiled: loss", loss)
-    if is_traced((problem, loss)):
-        raise JaxbaError("solve_tiled: the problem is traced, as inside jit, vmap and derivatives; use solve there.")
     max_nfev = require_stops("solve_tiled", max_nfev=max_nfev, ftol=ftol, xtol=xtol, gtol=gtol)
     solver = SchurLevenbergMarquardt(rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
 
@@ -71,7 +72,15 @@ def solve_tiled(
         "folder": folder,
         "workers": workers,
     }
-    return in_tiles("solve_tiled", problem, loss, solver, max_nfev, callback, checkpoint, room)
+
+    def on_host(problem: Problem, loss: AbstractLoss) -> Solution:
+        return in_tiles("solve_tiled", problem, loss, solver, max_nfev, callback, checkpoint, room)
+
+    if is_traced((problem, loss)):
+        return solve_reversibly(
+            problem, loss, on_host, lambda problem, loss: opened("solve_tiled", problem, loss, **room)
+        )
+    return on_host(problem, loss)
 
 
 def in_tiles(

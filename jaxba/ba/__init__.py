@@ -8,7 +8,7 @@ from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
-from jaxba.ba._reject import Rejected, solve_and_reject
+from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
 from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
@@ -25,13 +25,14 @@ from jaxba.ba.groups import (
     LeverArmPrior,
     PositionPrior,
 )
-from jaxba.ba.tiles import solve_batch, solve_tiled
+from jaxba.ba.tiles import BlockTile, Partition, partition, solve_batch, solve_tiled
 
 __all__ = [
     "PRIORS",
     "AbstractPrior",
     "AspectPrior",
     "AttitudePrior",
+    "BlockTile",
     "ControlPointPrior",
     "Covariance",
     "Dropped",
@@ -44,6 +45,7 @@ __all__ = [
     "JacobianBlock",
     "LeverArmPrior",
     "Observations",
+    "Partition",
     "Plan",
     "PlanShape",
     "PositionPrior",
@@ -64,9 +66,11 @@ __all__ = [
     "fast_jit",
     "free_gauge",
     "make_plan",
+    "partition",
     "prepare",
     "project_in_cameras",
     "quality",
+    "rejecting",
     "reprojection_errors",
     "residuals",
     "solve",

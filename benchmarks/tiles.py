@@ -5,7 +5,7 @@ memory is that of the solve: tile by tile in all memory, tile by tile under a li
 seconds a step (medians over all steps but the first), the peak of memory, and how seconds grow with images.
 
 `--sizes`: images of the blocks. `--limited`: which of them are solved under `--max-memory` as well. `--whole`: which of
-them are solved in one piece as well.
+them are solved in one piece as well. `--shapes`: in place of all that, blocks of other shapes beside square ones.
 """
 
 import argparse
@@ -19,8 +19,23 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 import jaxba
+
+_SHAPES: dict[str, dict[str, Any]] = {
+    "square": {"num_images": 1000},
+    "corridor, two lines": {"num_images": 1000, "num_lines": 2},
+    "two crossing directions": {"num_images": 1000, "flight": "crossing"},
+    "a second flight": {"num_images": 1000, "flight": "second"},
+    "square of 200": {"num_images": 200, "points_per_image": 279.5},
+    "orbit": {"num_images": 200, "flight": "orbit", "mean_track_length": 15.8},
+    "square, tracks as long": {"num_images": 200, "points_per_image": 95.0, "mean_track_length": 15.8},
+}
+"""Options of `uav_block`; the ones after a square are compared with it, and have as many observations."""
+_ROUNDS = 3  # over all shapes, of which the median counts
 
 
 def main() -> None:
@@ -29,10 +44,14 @@ def main() -> None:
     parser.add_argument("--limited", type=int, nargs="*", default=[16000])
     parser.add_argument("--whole", type=int, nargs="*", default=[1000, 4000])
     parser.add_argument("--max-memory", default="4GB")
+    parser.add_argument("--shapes", action="store_true")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
         _one(*options.one)
+        return
+    if options.shapes:
+        _shapes()
         return
     print("| images | observations | way | set-up (s) | a step (s) | steps | result | peak of memory (GB) |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
@@ -40,10 +59,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for size in sorted({*options.sizes, *options.limited, *options.whole}):
             file = Path(folder) / f"{size}.npz"
-            _run("make", file, str(size))
+            _run("make", file, {"num_images": size})
             ways = (("tiles", options.sizes), (options.max_memory, options.limited), ("whole", options.whole))
             for way in [name for name, sizes in ways if size in sizes]:
-                found = _run(way, file, "")
+                found = _run(way, file)
                 seconds.setdefault(way, {})[size] = found["step"]
                 print(
                     f"| {size} | {found['observations']:,} | {way} | {found['setup']:.1f} | {found['step']:.2f} | "
@@ -57,18 +76,42 @@ def main() -> None:
             print(f"{way}: from {small} to {large} images seconds a step grow with images to the {growth:.2f}")
 
 
-def _run(way: str, file: Path, size: str) -> dict[str, float]:
-    command = [sys.executable, "-m", "benchmarks.tiles", "--one", way, str(file), size]
+def _shapes() -> None:
+    """Print the seconds a step and the memory of every shape, and their ratios to those of the square before it."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = {name: Path(folder) / f"{number}.npz" for number, name in enumerate(_SHAPES)}
+        for name, file in files.items():
+            _run("make", file, _SHAPES[name])
+        rounds = [{name: _run("tiles", file) for name, file in files.items()} for _ in range(_ROUNDS)]
+    print("| shape | images | observations | pairs each | a step (s) | ratio | memory (kB each) | ratio |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    square = 0.0, 0.0
+    for name, options in _SHAPES.items():
+        found = rounds[0][name]
+        step = statistics.median(of[name]["step"] for of in rounds)
+        memory = statistics.median((of[name]["peak"] - of[name]["loaded"]) for of in rounds) / found["observations"]
+        if name.startswith("square") and "mean_track_length" not in options:
+            square = step / found["observations"], memory
+        print(
+            f"| {name} | {options['num_images']} | {found['observations']:,} | {found['pairs']:.1f} | {step:.2f} | "
+            f"{step / found['observations'] / square[0]:.2f} | {memory / 1e3:.2f} | {memory / square[1]:.2f} |"
+        )
+
+
+def _run(way: str, file: Path, options: dict[str, Any] | None = None) -> dict[str, float]:
+    command = [sys.executable, "-m", "benchmarks.tiles", "--one", way, str(file), json.dumps(options)]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
-def _one(way: str, file: str, size: str) -> None:
+def _one(way: str, file: str, options: str) -> None:
     """Make a block, or solve it in one way, and print what was measured as JSON."""
     if way == "make":
-        jaxba.write_tile(file, jaxba.synthetic.uav_block(int(size), side_overlap=0.7).problem)
+        jaxba.write_tile(file, jaxba.synthetic.uav_block(**json.loads(options), side_overlap=0.7).problem)
         print("{}")
         return
     problem = jaxba.read_tile(file)
+    views = np.bincount(problem.observations.point_index)
+    loaded = _peak()
     begun = time.perf_counter()
     if way == "whole":
         solution = jaxba.solve(problem, max_nfev=10)
@@ -83,9 +126,16 @@ def _one(way: str, file: str, size: str) -> None:
         "step": statistics.median([b - a for a, b in itertools.pairwise(ends)][1:]),
         "steps": len(ends) - 1,
         "result": solution.result,
-        "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0,
+        "pairs": float(np.sum(views * (views - 1) / 2) / problem.num_observations),
+        "loaded": loaded,
+        "peak": _peak(),
     }
     print(json.dumps(found))
+
+
+def _peak() -> float:
+    """Return the most bytes that this process has held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
 
 
 if __name__ == "__main__":

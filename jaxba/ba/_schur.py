@@ -12,7 +12,8 @@ the reduced system over images and border, U, B and C the blocks that were there
 
 plus the priors and the damping. Sums over an image are batched products of runs of rows; sums over pairs are products
 of short runs gathered a few at a time, so that they stay in the cache: 188k pairs of 500 images take 10 ms, where one
-product a pair takes 56 ms. Right-hand sides and back-substitution need W and the points' L^-1 alone.
+product a pair takes 56 ms. They are added up at once: the products of all runs are as large as Z where tracks are long.
+Right-hand sides and back-substitution need W and the points' L^-1 alone.
 """
 
 import equinox as eqx
@@ -224,15 +225,16 @@ def _sum_pairs(system: System, z: Float[Array, "rows 3 block"]) -> Float[Array, 
     if shape.num_blocks == 0:
         return jnp.zeros((0, shape.block, shape.block), z.dtype)
 
-    def chunk(_: None, pairs: tuple[Array, Array]) -> tuple[None, Array]:
+    def chunk(total: Array, fields: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        *pairs, block = fields
         first, second = (rows_of(z, p).reshape(p.shape[0], -1, shape.block) for p in pairs)
-        return None, jnp.einsum("rka,rkb->rab", first, second)
+        runs = jnp.einsum("rka,rkb->rab", first, second)
+        return total.at[block].add(-runs, indices_are_sorted=True, mode="promise_in_bounds"), None
 
-    _, runs = jax.lax.scan(chunk, None, (jnp.asarray(system.pair_first), jnp.asarray(system.pair_second)))
-    runs = runs.reshape(-1, shape.block, shape.block)
-    return -jax.ops.segment_sum(
-        runs, system.pair_block, num_segments=shape.num_blocks, indices_are_sorted=True, mode="promise_in_bounds"
-    )
+    first, second = jnp.asarray(system.pair_first), jnp.asarray(system.pair_second)
+    block = jnp.asarray(system.pair_block).reshape(first.shape[:2])
+    nothing = jnp.zeros((shape.num_blocks, shape.block, shape.block), z.dtype)
+    return jax.lax.scan(chunk, nothing, (first, second, block))[0]
 
 
 def _add_priors(

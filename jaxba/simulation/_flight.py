@@ -6,6 +6,7 @@ their northing (2000 images and 170k points: 0.4 s), then one projection of all 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -22,6 +23,8 @@ Terrain = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, " n"]]
 """Height over the mean terrain, metres, at (east, north)."""
 
 MIN_POINTS_PER_IMAGE = 20
+
+FlightPattern = Literal["lines", "crossing", "second", "orbit"]
 
 
 @dataclass(frozen=True)
@@ -76,13 +79,40 @@ def field_of_view(camera: AbstractCamera, frame_px: Float[np.ndarray, "2 2"]) ->
 
 
 def flight_plan(
-    num_images: int, base_m: float, spacing_m: float, num_lines: int | None = None
+    num_images: int,
+    base_m: float,
+    spacing_m: float,
+    num_lines: int | None = None,
+    *,
+    flight: FlightPattern = "lines",
+    radius_m: float = 0.0,
 ) -> tuple[Float[np.ndarray, "images 2"], Rotation]:
     """Return the planned (east, north) of each image, centred on the origin, and its level attitude `cam_from_world`.
 
     Lines run north, then south, and so on eastwards, `spacing_m` apart, with an image every `base_m`. Without
-    `num_lines` the block is about square, of two lines at least from four images on.
+    `num_lines` a flight is about square, of two lines at least from four images on. The second half of "crossing" and
+    "second" is a flight of its own over the same place, along east and west for "crossing". "orbit" is a circle of
+    `radius_m` whose cameras look inwards, 45 degrees down.
     """
+    if flight == "orbit":
+        angle = 2 * np.pi * np.arange(num_images) / num_images
+        outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(num_images)], axis=1)
+        up = np.array([0.0, 0.0, 1.0])
+        axes = np.cross(up, outward), (outward - up) / np.sqrt(2), (-outward - up) / np.sqrt(2)
+        return radius_m * outward[:, :2], Rotation.from_matrix(np.stack(axes, axis=1))
+    if flight == "lines":
+        return _lines(num_images, base_m, spacing_m, num_lines)
+    first, first_level = _lines(num_images - num_images // 2, base_m, spacing_m, num_lines)
+    second, second_level = _lines(num_images // 2, base_m, spacing_m, num_lines)
+    if flight == "crossing":
+        turn = Rotation.from_euler("z", 90, degrees=True)
+        second, second_level = second[:, ::-1] * [-1.0, 1.0], second_level * turn.inv()
+    return np.concatenate([first, second]), Rotation.concatenate([first_level, second_level])
+
+
+def _lines(
+    num_images: int, base_m: float, spacing_m: float, num_lines: int | None
+) -> tuple[Float[np.ndarray, "images 2"], Rotation]:
     if num_lines is None:
         num_lines = max(2 if num_images >= 4 else 1, round(np.sqrt(num_images * base_m / spacing_m)))
     per_line = np.array([len(part) for part in np.array_split(np.arange(num_images), num_lines)])
@@ -113,21 +143,23 @@ def make_tracks(
     terrain: Terrain,
     *,
     reach_m: Float[np.ndarray, "2"],
+    beyond_m: Float[np.ndarray, "2"],
     num_tie: int,
     mean_length: float,
     num_marks: int,
 ) -> Tracks:
     """Return `num_marks` marks and `num_tie` tie points with their image points.
 
-    `reach_m` is how far east and north of its station an image may see. Tie points are drawn evenly over the block, are
-    detected in each image that they lie in with one probability, and stay if detected twice.
+    `reach_m` is how far east and north of its station an image may see. Tie points are drawn evenly over the block and
+    `beyond_m` its outermost stations, are detected in each image that they lie in with one probability, and stay if
+    detected twice.
     """
     low, high = images.centers[:, :2].min(axis=0), images.centers[:, :2].max(axis=0)
     # additive recurrence: any first few of the marks are spread evenly (Roberts 2018)
     spread = (0.5 + np.arange(1, num_marks + 1)[:, None] * [0.7548776662, 0.5698402910]) % 1.0
     marks = low + spread * (high - low)
     for surplus in (1.3, 4.0, 16.0):
-        ties = rng.uniform(low - reach_m, high + reach_m, size=(round(surplus * num_tie), 2))
+        ties = rng.uniform(low - beyond_m, high + beyond_m, size=(round(surplus * num_tie), 2))
         plan = np.concatenate([marks, ties])
         points = np.column_stack([plan, terrain(plan)])
         image, point, xy = _in_view(images, points, reach_m)

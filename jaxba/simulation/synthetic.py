@@ -9,6 +9,7 @@ World: metres east, north, up; the origin lies on the mean terrain under the mid
 """
 
 from dataclasses import dataclass
+from typing import get_args
 
 import equinox as eqx
 import numpy as np
@@ -18,7 +19,15 @@ from scipy.spatial.transform import Rotation
 from jaxba._errors import JaxbaError
 from jaxba.ba import AttitudePrior, ControlPointPrior, LeverArmPrior, Observations, PositionPrior, Problem
 from jaxba.geometry import AbstractCamera, OpenCV, Pose
-from jaxba.simulation._flight import Images, Tracks, field_of_view, flight_plan, make_tracks, smooth_terrain
+from jaxba.simulation._flight import (
+    FlightPattern,
+    Images,
+    Tracks,
+    field_of_view,
+    flight_plan,
+    make_tracks,
+    smooth_terrain,
+)
 
 DRONE_CAMERA = OpenCV(fx=3652.0, fy=3649.0, cx=2748.5, cy=1816.2, k1=-0.045, k2=0.015, p1=0.0006, p2=-0.0004)
 """A drone's 20 MP camera, 5472 x 3648 pixels, with a mild distortion (up to 90 px, in the corners)."""
@@ -73,6 +82,7 @@ def uav_block(
     height_m: float = 100.0,
     forward_overlap: float = 0.8,
     side_overlap: float = 0.6,
+    flight: FlightPattern = "lines",
     num_lines: int | None = None,
     position_jitter_m: float = 1.0,
     attitude_jitter_rad: float = 0.03,
@@ -104,7 +114,11 @@ def uav_block(
       pixel coordinates centred on the image.
     - `num_cameras`: with more than one, each is a variation of `camera` (focal length 0.2%, principal point 3 px,
       distortion 10%) for a stretch of consecutive images; `num_images` of them give each image its own.
-    - `height_m`: above the mean terrain. `num_lines`: flight lines; by default as many as make the block square.
+    - `height_m`: above the mean terrain.
+    - `flight`: "lines" to and fro; "crossing", half of the images along lines across those of the other half; "second",
+      half of them in a second flight along the same lines; "orbit", a circle as wide as the cameras fly high, from
+      which they look at its middle, 45 degrees down.
+    - `num_lines`: of a flight; by default as many as make it square. With 2 or 3 it is a corridor.
     - `position_jitter_m`, `attitude_jitter_rad`: sigma an axis of the flight about its plan.
     - `terrain_relief_m`: highest minus lowest terrain; 0 is flat.
     - `points_per_image`: tie points over images. `mean_track_length`: of tie points, or as near to it as the overlap
@@ -158,6 +172,8 @@ def uav_block(
     ):
         if not low <= value <= high:
             raise JaxbaError(f"{name}={value} is out of range; choose it from {low:g} to {high:g}.")
+    if flight not in get_args(FlightPattern):
+        raise JaxbaError(f"flight={flight!r}: choose one of {', '.join(get_args(FlightPattern))}.")
     for name, value in (
         ("gnss_std_m", gnss_std_m),
         ("control_std_m", control_std_m),
@@ -172,7 +188,7 @@ def uav_block(
     frame_px = np.stack([corner, corner + image_size_px])
     view = field_of_view(camera, frame_px)
     spacing_m, base_m = height_m * (view[1] - view[0]) * (1 - np.array([side_overlap, forward_overlap]))
-    stations, level = flight_plan(num_images, base_m, spacing_m, num_lines)
+    stations, level = flight_plan(num_images, base_m, spacing_m, num_lines, flight=flight, radius_m=height_m)
     shift, turn = flight_rng.normal(size=(2, num_images, 3))
     centers = np.column_stack([stations, np.full(num_images, height_m)]) + position_jitter_m * shift
     attitudes = Rotation.from_rotvec(attitude_jitter_rad * turn) * level
@@ -181,12 +197,14 @@ def uav_block(
 
     images = Images(centers, attitudes.as_matrix(), cameras, camera_index, frame_px, 4 * pixel_std_px, view)
     reach = np.abs(view).max(axis=0)
-    tilted = reach + 2 * attitude_jitter_rad * (1 + reach**2)
+    reach_m = (reach + 2 * attitude_jitter_rad * (1 + reach**2)) * (height_m + terrain_relief_m / 2)
+    around = flight == "orbit"  # all see what lies between them
     tracks = make_tracks(
         track_rng,
         images,
         smooth_terrain(terrain_rng, terrain_relief_m, height_m),
-        reach_m=tilted * (height_m + terrain_relief_m / 2),
+        reach_m=np.full(2, np.inf) if around else reach_m,
+        beyond_m=np.zeros(2) if around else reach_m,
         num_tie=round(points_per_image * num_images),
         mean_length=mean_track_length,
         num_marks=num_control + num_check,

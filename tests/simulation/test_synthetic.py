@@ -12,6 +12,7 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import Unknowns
 from jaxba.geometry import BAL, OpenCVFisheye, Radial
 from jaxba.simulation import Survey, uav_block
+from jaxba.simulation._flight import FlightPattern
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +130,37 @@ def test_images_overlap_as_asked(forward: float, side: float) -> None:
     np.testing.assert_allclose(np.diff(lines[:, 0, 0]), (1 - side) * footprint[0], atol=0.06)
     np.testing.assert_allclose(lines[0, :, 1], lines[1, ::-1, 1], atol=1e-9)  # flown up and down
     np.testing.assert_allclose(attitude.as_matrix()[[0, 6]], [np.diag([1, -1, -1]), np.diag([-1, 1, -1])], atol=1e-12)
+
+
+@pytest.mark.parametrize("flight", ["lines", "crossing", "second", "orbit"])
+def test_images_stand_and_look_as_their_flight_says(flight: FlightPattern) -> None:
+    # breaks where the crossing lines are turned and not their cameras, or an orbit looks outwards
+    survey = uav_block(
+        40, flight=flight, position_jitter_m=0.0, attitude_jitter_rad=0.0, terrain_relief_m=0.0, side_overlap=0.7,
+        height_m=80.0,
+    )  # fmt: skip
+    centers, attitude = centers_and_attitudes(survey)
+    seen = survey.problem.observations
+    np.testing.assert_allclose(opencv_pixels(survey), survey.truth.xy_px, atol=1e-6)
+    assert np.bincount(seen.image_index).min() >= 20 and abs(len(seen.image_index) / 40 - 260) < 40
+    right, down, ahead = np.swapaxes(attitude.as_matrix(), 0, 1)
+    if flight == "orbit":
+        np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 80.0)
+        np.testing.assert_allclose(centers + 80.0 * np.sqrt(2) * ahead, np.zeros((40, 3)), atol=1e-9)
+        assert np.all(np.abs(right[:, 2]) < 1e-12) and np.all(down[:, 2] < 0)
+        assert np.bincount(seen.point_index).max() == 40  # all see the middle
+        return
+    np.testing.assert_allclose(ahead, np.tile([0.0, 0.0, -1.0], (40, 1)), atol=1e-12)
+    along = np.abs(np.einsum("ni,ni->n", np.diff(centers, axis=0), down[:-1])) / np.linalg.norm(
+        np.diff(centers, axis=0), axis=1
+    )
+    assert np.mean(along > 1 - 1e-9) > 0.8  # the next image lies ahead but where lines end
+    across = np.abs(down[0] @ down.T) < 1e-9
+    assert np.array_equal(np.flatnonzero(across), np.arange(20, 40) if flight == "crossing" else [])
+    if flight == "second":
+        np.testing.assert_allclose(centers[20:], centers[:20])
+    if flight == "crossing":
+        np.testing.assert_allclose(np.ptp(centers[20:], axis=0), np.ptp(centers[:20], axis=0)[[1, 0, 2]])
 
 
 def test_same_seed_same_survey_and_outliers_leave_the_block_unchanged() -> None:

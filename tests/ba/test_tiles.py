@@ -363,7 +363,8 @@ _THETA = {
 def test_the_gradient_is_that_of_central_differences() -> None:
     # breaks where a tile's part is left out or counts twice, or what a bound holds moves
     with jax.enable_x64(True):
-        theta = jaxba.ba.prepare(_everything()).problem, Huber(jnp.array(1.0))
+        problem = _whole("everything", 60).apply(jaxba.ba.prepare(_everything()).problem)  # a few steps from each end
+        theta = problem, Huber(jnp.array(1.0))
         numbers, rest = eqx.partition(theta, eqx.is_inexact_array)
         found = jax.grad(lambda n: _number_of(eqx.combine(n, rest), **_TIGHT))(numbers)
         for name, where in _THETA.items():
@@ -374,7 +375,7 @@ def test_the_gradient_is_that_of_central_differences() -> None:
                 step = np.where(slope != 0, 1e-5, 0.0)
                 assert np.count_nonzero(step) == 1
             high, low = (float(_number_of(eqx.tree_at(where, theta, value + s), **_TIGHT)) for s in (step, -step))
-            np.testing.assert_allclose(np.sum(slope * step), (high - low) / 2, rtol=3e-4, err_msg=name)
+            np.testing.assert_allclose(np.sum(slope * step), (high - low) / 2, rtol=1e-3, err_msg=name)
 
 
 def _grad(problem: Problem, cost: str = "final_cost", **options: object) -> None:

@@ -2,6 +2,7 @@ from . import ba as ba, geometry as geometry, io as io
 from ._errors import JaxbaError as JaxbaError
 from .ba import (
     AttitudePrior as AttitudePrior,
+    BlockTile as BlockTile,
     ControlPointPrior as ControlPointPrior,
     Covariance as Covariance,
     Free as Free,
@@ -10,6 +11,7 @@ from .ba import (
     IntrinsicsPrior as IntrinsicsPrior,
     LeverArmPrior as LeverArmPrior,
     Observations as Observations,
+    Partition as Partition,
     Plan as Plan,
     PositionPrior as PositionPrior,
     Problem as Problem,
@@ -24,6 +26,7 @@ from .ba import (
     covariance as covariance,
     free_gauge as free_gauge,
     make_plan as make_plan,
+    partition as partition,
     quality as quality,
     reprojection_errors as reprojection_errors,
     residuals as residuals,

@@ -8,7 +8,7 @@ from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
-from jaxba.ba._reject import Rejected, solve_and_reject
+from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
 from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
@@ -26,6 +26,7 @@ from jaxba.ba.groups import (
     PositionPrior,
 )
 from jaxba.ba.tiles._batch import solve_batch
+from jaxba.ba.tiles._partition import BlockTile, Partition, partition
 from jaxba.ba.tiles._solve_tiled import solve_tiled
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "AbstractPrior",
     "AspectPrior",
     "AttitudePrior",
+    "BlockTile",
     "ControlPointPrior",
     "Covariance",
     "Dropped",
@@ -45,6 +47,7 @@ __all__ = [
     "JacobianBlock",
     "LeverArmPrior",
     "Observations",
+    "Partition",
     "Plan",
     "PlanShape",
     "PositionPrior",
@@ -65,9 +68,11 @@ __all__ = [
     "fast_jit",
     "free_gauge",
     "make_plan",
+    "partition",
     "prepare",
     "project_in_cameras",
     "quality",
+    "rejecting",
     "reprojection_errors",
     "residuals",
     "solve",

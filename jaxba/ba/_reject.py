@@ -6,7 +6,7 @@ left out comes back if it fits after all.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import Any
 
 import equinox as eqx
@@ -58,27 +58,39 @@ def solve_and_reject(
     >>> bool((cleaned.used & survey.truth.is_outlier).sum() < 0.1 * survey.truth.is_outlier.sum())
     True
     """
+    steps = rejecting(problem, rounds=rounds, mad_factor=mad_factor)
+    subset = next(steps)
+    while True:
+        try:
+            subset = steps.send(solver(subset, **options))
+        except StopIteration as done:
+            return done.value
+
+
+def rejecting(problem: Problem, *, rounds: int = 2, mad_factor: float = 2.5) -> Generator[Problem, Solution, Rejected]:
+    """Yield the problem of each round, take its solution, and return what `solve_and_reject` does.
+
+    So whoever solves has a choice of when and how, such as many problems at once.
+    """
     require_number("solve_and_reject: rounds", rounds, 0.0, 2.0**31 - 1, "give a whole number, 0 or more", whole=True)
     require_mad_factor(mad_factor)
     used = np.ones(problem.num_observations, bool)
-    solution, used = _solve_with(problem, used, solver, options)
-    found = quality(solution.apply(problem), used, mad_factor=mad_factor)
+    solution = yield problem
     num_rejected, solutions = [], [solution]
-    for _ in range(int(rounds)):
+    while True:
+        used = _kept(used, solution)
+        problem = solution.apply(problem)
+        found = quality(problem, used, mad_factor=mad_factor)
         fits = found.error_px <= found.threshold_px
-        if np.array_equal(fits, used) or solution.result == "interrupted":
-            break
+        if len(num_rejected) == int(rounds) or np.array_equal(fits, used) or solution.result == "interrupted":
+            return Rejected(tuple(solutions), used, found, tuple(num_rejected))
         num_rejected.append(int(np.count_nonzero(~fits)))
-        solution, used = _solve_with(solution.apply(problem), fits, solver, options)
+        used = fits
+        solution = yield _with_observations(problem, used)
         solutions.append(solution)
-        found = quality(solution.apply(problem), used, mad_factor=mad_factor)
-    return Rejected(tuple(solutions), used, found, tuple(num_rejected))
 
 
-def _solve_with(
-    problem: Problem, used: Bool[np.ndarray, " observations"], solver: Callable[..., Solution], options: dict[str, Any]
-) -> tuple[Solution, Bool[np.ndarray, " observations"]]:
-    """Solve with some of the observations; return the solution and which of them the solve itself kept."""
+def _with_observations(problem: Problem, used: Bool[np.ndarray, " observations"]) -> Problem:
     seen = problem.observations
     subset = Observations(
         np.asarray(seen.xy_px)[used],
@@ -86,8 +98,12 @@ def _solve_with(
         np.asarray(seen.image_index)[used],
         np.asarray(seen.point_index)[used],
     )
-    solution = solver(eqx.tree_at(lambda p: p.observations, problem, subset), **options)
+    return eqx.tree_at(lambda p: p.observations, problem, subset)
+
+
+def _kept(used: Bool[np.ndarray, " observations"], solution: Solution) -> Bool[np.ndarray, " observations"]:
+    """Return which of the observations that a solve was given it kept."""
     kept = used.copy()
     if solution.report is not None:
         kept[used] = ~solution.report.dropped.observations
-    return solution, kept
+    return kept

@@ -3,5 +3,6 @@
 from jaxba.ba.checks._check import Dropped, Prepared, Reason, prepare
 from jaxba.ba.checks._gauge import free_gauge, require_gauge
 from jaxba.ba.checks._plausible import implausible_cameras
+from jaxba.ba.checks._validate import validate
 
-__all__ = ["Dropped", "Prepared", "Reason", "free_gauge", "implausible_cameras", "prepare", "require_gauge"]
+__all__ = ["Dropped", "Prepared", "Reason", "free_gauge", "implausible_cameras", "prepare", "require_gauge", "validate"]

@@ -7,7 +7,7 @@ get like shapes, so that they share what is compiled.
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
@@ -62,13 +62,13 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
     seen = problem.observations
     tile_of_row = tree.tile_of_point[np.asarray(seen.point_index)]
     rows_of_tile = np.split(np.argsort(tile_of_row, kind="stable"), np.cumsum(np.bincount(tile_of_row))[:-1])
-    owner = np.zeros(problem.num_images, np.int32)
+    owner, camera_index = np.zeros(problem.num_images, np.int32), np.asarray(problem.camera_index)
     for number in reversed(range(len(rows_of_tile))):
         owner[np.asarray(seen.image_index)[rows_of_tile[number]]] = number
     unseen = np.bincount(np.asarray(seen.image_index), minlength=problem.num_images) == 0
     of_cameras = np.zeros(problem.num_cameras, np.int32)
     if shape.own_cameras:  # else every tile has all cameras
-        of_cameras[np.asarray(problem.camera_index)] = owner
+        of_cameras[camera_index] = owner
     owners = {"image_index": owner, "point_index": tree.tile_of_point, "camera_index": of_cameras}
     tile_of_prior = [_tile_of_rows(prior, owners) for prior in problem.priors]
 
@@ -77,7 +77,8 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
         images = np.unique(np.append(np.asarray(seen.image_index)[rows], np.flatnonzero(unseen & (number == 0))))
         points = np.flatnonzero(tree.tile_of_point == number)
         chosen = [np.flatnonzero(tiles == number) for tiles in tile_of_prior]
-        found, cameras = _part(problem, rows, images, points, chosen, own_cameras=shape.own_cameras)
+        cameras = np.sort(camera_index[images]) if shape.own_cameras else np.arange(problem.num_cameras)
+        found = sub_problem(problem, rows, images, points, cameras, chosen)
         order = np.argsort(tree.rank[images]).astype(np.int32)
         plan = make_plan(found, linear_solver="dense", like=like, image_order=order)
         return found, Tile(images, cameras, points, images[order], plan)
@@ -97,19 +98,19 @@ def _tile_of_rows(prior: AbstractPrior, owners: dict[str, Int[np.ndarray, " _"]]
     return np.zeros(num_rows(prior), np.int32)
 
 
-def _part(
+def sub_problem(
     problem: Problem,
     rows: Int[np.ndarray, " rows"],
     images: Int[np.ndarray, " images"],
     points: Int[np.ndarray, " points"],
-    chosen: list[Int[np.ndarray, " _"]],
-    *,
-    own_cameras: bool,
-) -> tuple[Problem, Int[np.ndarray, " cameras"]]:
-    """Return the problem of a tile, and its cameras: its images' where each has its own, else all."""
+    cameras: Int[np.ndarray, " cameras"],
+    of_priors: Sequence[Int[np.ndarray, " _"]],
+) -> Problem:
+    """Return the problem of these observations, images, points and cameras, and of these rows of each prior.
+
+    Numbers ascend, and whatever is referred to is among them. Images have no names.
+    """
     seen, free = problem.observations, problem.free
-    camera_index = np.asarray(problem.camera_index)
-    cameras = np.sort(camera_index[images]) if own_cameras else np.arange(problem.num_cameras)
 
     def place(kept: Int[np.ndarray, " kept"], count: int) -> Int[np.ndarray, " count"]:
         places = np.zeros(count, np.int32)
@@ -135,13 +136,13 @@ def _part(
         places["image_index"][np.asarray(seen.image_index)[rows]],
         places["point_index"][np.asarray(seen.point_index)[rows]],
     )
-    part = Problem(
+    return Problem(
         poses=Pose(np.asarray(problem.poses.quaternion)[images], np.asarray(problem.poses.translation)[images]),
         cameras=jax.tree.map(lambda of_cameras: np.asarray(of_cameras)[cameras], problem.cameras),
-        camera_index=places["camera_index"][camera_index[images]],
+        camera_index=places["camera_index"][np.asarray(problem.camera_index)[images]],
         points=np.asarray(problem.points)[points],
         observations=of_observations,
-        priors=tuple(taken(*each) for each in zip(problem.priors, chosen, strict=True)),
+        priors=tuple(taken(*each) for each in zip(problem.priors, of_priors, strict=True)),
         lever_arm=np.asarray(problem.lever_arm),
         free=Free(
             np.asarray(free.poses)[images],
@@ -152,4 +153,3 @@ def _part(
         lower=np.asarray(problem.lower)[cameras],
         upper=np.asarray(problem.upper)[cameras],
     )
-    return part, cameras

@@ -17,7 +17,7 @@ Cost: O(observations) a level and direction.
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import camera_centers
@@ -60,6 +60,48 @@ def dissect(problem: Problem, *, block: int, border: int, max_observations: floa
     - `max_observations`: of a tile, unless a single point has more. `num_tiles`: at least so many, where points allow.
     """
     return _Dissection(problem, block, border, max_observations).tree(num_tiles)
+
+
+def dissect_images(problem: Problem, rows: Int[np.ndarray, " rows"], most: float) -> Int[np.ndarray, " images"]:
+    """Return the part that each image falls into, counted from 0, where images themselves are cut by such planes.
+
+    An image goes where most of what it sees lies. So many parts come about as are needed.
+
+    - `rows`: observations, sorted by image and some of each, that tell what it sees; an image counts as many as it has.
+    - `most`: that the images of a part may count, unless one has more.
+    """
+    cuts = _Dissection(problem, 0, 0, np.inf)
+    part_of_image = np.zeros(problem.num_images, np.int32)
+    waiting, parts = [rows], 0
+    while waiting:
+        rows = waiting.pop()
+        seen = cuts._seen(rows)
+        counts = np.diff(seen.starts, append=len(rows))
+        num_parts = int(np.ceil(len(rows) / most))
+        if num_parts == 1 or len(counts) == 1:
+            part_of_image[seen.images] = parts
+            parts += 1
+            continue
+        while True:
+            share = (num_parts // 2) / num_parts
+            slack = most * num_parts / len(rows) - 1
+            least, largest = -slack * (1 - share), slack * share  # beyond them, one side would need one part more
+            found = cuts._cut(seen, share, np.clip(_CUTS, least / 2, largest / 2))  # and leave slack to further cuts
+            of_left = (
+                np.zeros(len(counts)) if found is None else np.add.reduceat(found.left * 1.0, seen.starts) / counts
+            )
+            order = np.argsort(-of_left, kind="stable")
+            shares = np.cumsum(counts[order])[:-1] / len(rows) - share
+            beyond = np.maximum(shares - largest, 0) + np.maximum(least - shares, 0)
+            wanted = np.abs(np.arange(1, len(counts)) - np.count_nonzero(of_left > 0.5))
+            first = np.lexsort((wanted, beyond.round(9)))[0]
+            if beyond[first] < 1e-9 or num_parts >= len(counts):
+                break
+            num_parts += 1  # images are too large for a cut without slack
+        first += 1
+        on_left = np.isin(cuts.image[rows], seen.images[order[:first]])
+        waiting += [rows[~on_left], rows[on_left]]
+    return part_of_image
 
 
 def front_flops(eliminated: int | np.integer, rest: int | np.integer) -> float:
@@ -130,8 +172,11 @@ class _Dissection:
         images = of_rows[starts]
         return _Seen(rows, starts, images, np.diff(starts, append=len(rows)) == self.count[images])
 
-    def _cut(self, seen: "_Seen", share: float) -> "_Cut | None":
-        """Return the best cut that leaves about this share of the observations on the left; None where all are one."""
+    def _cut(self, seen: "_Seen", share: float, cuts: Float[np.ndarray, " cuts"] = _CUTS) -> "_Cut | None":
+        """Return the best cut that leaves about this share of the observations on the left; None where all are one.
+
+        `cuts`: which places are tried, from that one.
+        """
         centers = self.centers[seen.images] - self.centers[seen.images].mean(axis=0)
         axes = np.linalg.svd(centers.T @ centers)[0][:, :2]
         angles = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
@@ -140,9 +185,9 @@ class _Dissection:
             low = np.minimum.reduceat(along, seen.starts, axis=0)
             high = np.maximum.reduceat(along, seen.starts, axis=0)
             sample = along[:: -(-len(along) // _SAMPLE)]
-            places = np.quantile(sample, np.clip(share + _CUTS, 0, 1), axis=0)
+            places = np.quantile(sample, np.clip(share + cuts, 0, 1), axis=0)
             across = np.sum((low <= places[:, None]) & (high > places[:, None]), axis=1, dtype=float)
-            across += np.abs(_CUTS)[:, None]  # of equals the one nearest to the middle
+            across += np.abs(cuts)[:, None]  # of equals the one nearest to the middle
             across[np.all((high <= places[:, None]), axis=1)] = np.inf  # nothing on the right
             best, direction = np.unravel_index(np.argmin(across), across.shape)
             if np.isfinite(across[best, direction]):

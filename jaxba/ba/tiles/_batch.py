@@ -8,6 +8,7 @@ problem badly over the cores, and a batch under `vmap` steps until its last prob
 import dataclasses
 import functools
 import os
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +22,7 @@ from jaxba._errors import JaxbaError
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._plan_shape import alike, larger
 from jaxba.ba._problem import Problem
-from jaxba.ba._solution import Solution
+from jaxba.ba._solution import HistoryStep, Solution
 from jaxba.ba._solve import SOLVERS, Method, solve, solve_prepared
 from jaxba.ba._solvers import require_stops
 from jaxba.ba._system import is_traced
@@ -47,10 +48,11 @@ def solve_batch(
 
     - `loss`, `method`, `max_nfev`, `ftol`, `xtol`, `gtol`: as in `solve`, for all of them.
     - `workers`: problems that are worked on at a time; as many as there are cores if None. It does not change results.
-    - `callback`: called with a problem's place and its solution as soon as these are known, in any order.
+    - `callback`: called with a problem's place and its solution as soon as these are known, in any order and by any
+      thread.
 
     Every solution is the one of `solve`, with a report of its own. Where values are traced, as in derivatives, the
-    problems are solved one after another.
+    problems are solved one after another. Ctrl-C ends the batch within a step, and so does an error of the callback.
 
     Raises `JaxbaError` as `solve` does, before anything is solved, and says for which problem.
 
@@ -73,19 +75,30 @@ def solve_batch(
     solver = SOLVERS[method](rtol=float(ftol), atol=float(gtol), xtol=float(xtol))
     work = _arranged(problems)
     solutions: dict[int, Solution] = {}
+    stopped = threading.Event()
+
+    def go_on(_: HistoryStep) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt  # which ends this thread's solve
 
     def adjust(number: int) -> None:
         prepared, plan, seconds = work[number]
         with jax.enable_x64(True):  # of this thread
             begun = time.perf_counter() - seconds
-            solutions[number] = solve_prepared(prepared, plan, loss, solver, max_nfev, np.float64, None, begun)
-        if callback is not None:
-            callback(number, solutions[number])
+            solution = solve_prepared(prepared, plan, loss, solver, max_nfev, np.float64, go_on, begun)
+        solutions[number] = solution
+        if callback is not None and solution.result != "interrupted":
+            callback(number, solution)
 
     first_of_shape = {plan.shape: number for number, (_, plan, _) in reversed(list(enumerate(work)))}
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(int(workers)) as pool:
-        for numbers in (sorted(first_of_shape.values()), sorted(set(range(len(work))) - set(first_of_shape.values()))):
-            list(pool.map(adjust, numbers))  # the first of each shape compiles for the others
+        try:
+            firsts = sorted(first_of_shape.values())
+            for numbers in (firsts, sorted(set(range(len(work))) - set(firsts))):
+                list(pool.map(adjust, numbers))  # the first of each shape compiles for the others
+        except BaseException:
+            stopped.set()
+            raise
     return [solutions[number] for number in range(len(work))]
 
 

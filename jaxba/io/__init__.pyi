@@ -42,9 +42,18 @@ from ._las import write_las as write_las
 from ._list_cells import without_fillers as without_fillers
 from ._opensfm import write_opensfm as write_opensfm
 from ._ply import write_ply as write_ply
-from ._problem import read_problem as read_problem
-from ._read import text_of as text_of
+from ._problem import problem_of_bytes as problem_of_bytes, read_problem as read_problem
+from ._read import read_bytes as read_bytes, text_of as text_of
 from ._read_colmap import ColmapModel as ColmapModel, read_colmap_text as read_colmap_text
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
 from ._sites import SITE_COLUMNS as SITE_COLUMNS, Sites as Sites, make_sites as make_sites
 from ._tile import read_tile as read_tile, write_tile as write_tile
+from ._tiles import (
+    TileFile as TileFile,
+    fingerprint_of as fingerprint_of,
+    place_of as place_of,
+    read_block_tile as read_block_tile,
+    read_tiles as read_tiles,
+    solved_before as solved_before,
+    write_tiles as write_tiles,
+)

@@ -45,7 +45,11 @@ def read_bal(path: str | os.PathLike[str]) -> Problem:
     >>> read_bal(path).observations.xy_px.tolist()  # y points down
     [[3.0, 4.0]]
     """
-    label, data = os.fspath(path), read_bytes(path)
+    return bal_of_bytes(read_bytes(path), os.fspath(path))
+
+
+def bal_of_bytes(data: bytes, label: str) -> Problem:
+    """Return the problem in the bytes of a BAL file; `label` names the file in messages. Raises as `read_bal` does."""
     if data.startswith(_BZ2_MAGIC):
         try:
             data = bz2.decompress(data)

@@ -2,11 +2,13 @@
 
 import os
 
+import numpy as np
+
 from jaxba.ba import Problem
-from jaxba.io._bal import read_bal
+from jaxba.io._bal import bal_of_bytes
 from jaxba.io._npz import ZIP_MAGIC
 from jaxba.io._read import read_bytes
-from jaxba.io._tile import read_tile
+from jaxba.io._tile import tile_of_bytes
 
 
 def read_problem(path: str | os.PathLike[str]) -> Problem:
@@ -21,5 +23,14 @@ def read_problem(path: str | os.PathLike[str]) -> Problem:
     >>> read_problem(path).num_observations
     1
     """
-    reader = read_tile if read_bytes(path).startswith(ZIP_MAGIC) else read_bal
-    return reader(path)
+    return problem_of_bytes(read_bytes(path), os.fspath(path))[0]
+
+
+def problem_of_bytes(data: bytes, label: str) -> tuple[Problem, dict[str, np.ndarray]]:
+    """Return the problem in the bytes of a file of any format, and the extras of a tile; of BAL there are none.
+
+    `label` names the file in messages. Raises `JaxbaError` as `read_problem` does.
+    """
+    if data.startswith(ZIP_MAGIC):
+        return tile_of_bytes(data, label)
+    return bal_of_bytes(data, label), {}

@@ -46,8 +46,17 @@ def read_tile(path: str | os.PathLike[str]) -> Problem:
     >>> read_tile(path).observations.std_px.tolist()
     [1.0]
     """
-    label = os.fspath(path)
-    return _problem_from_arrays(_checked(read_npz(read_bytes(path), label), label))
+    return tile_of_bytes(read_bytes(path), os.fspath(path))[0]
+
+
+def tile_of_bytes(data: bytes, label: str) -> tuple[Problem, dict[str, np.ndarray]]:
+    """Return the problem in the bytes of a tile, and its extras by their names without `extra_`.
+
+    `label` names the file in messages. Raises `JaxbaError` as `read_tile` does.
+    """
+    arrays = read_npz(data, label)
+    extras = {name.removeprefix(EXTRA): array for name, array in arrays.items() if name.startswith(EXTRA)}
+    return _problem_from_arrays(_checked(arrays, label)), extras
 
 
 def write_tile(
@@ -69,15 +78,23 @@ def write_tile(
     >>> write_tile(pathlib.Path(tempfile.mkdtemp(), "tile.npz"), problem)
     """
     label = os.fspath(path)
-    arrays = _arrays_from_problem(problem, label)
-    checked = _checked(arrays, f"{label}, not written")
-    arrays = {name: checked[name] for name in arrays}
+    arrays = arrays_of(problem, label)
     for name, extra in (extras or {}).items():
         arrays[EXTRA + name] = np.asarray(extra)
         if arrays[EXTRA + name].dtype.hasobject:
             raise JaxbaError(f"{label}: extra {name!r} holds Python objects; give numbers, booleans or strings.")
     with write_atomically(path) as file:
         write_npz(file, arrays)
+
+
+def arrays_of(problem: Problem, label: str) -> dict[str, np.ndarray]:
+    """Return the arrays of a problem as a tile holds them; `label` names the file, which is not written, in messages.
+
+    Raises `JaxbaError` as `write_tile` does.
+    """
+    arrays = _arrays_from_problem(problem, label)
+    checked = _checked(arrays, f"{label}, not written")
+    return {name: checked[name] for name in arrays}
 
 
 def _checked(arrays: Mapping[str, np.ndarray], label: str) -> dict[str, np.ndarray]:

@@ -69,6 +69,8 @@ PUBLISHED = {  # the defaults and ranges that users of such pipelines know
     "adjust.edge_median_limit": ("3", "2 to 6"),
     "tiles.chunk_size": ("500", "100 to 5000"),
     "tiles.overlap": ("50", "10 to 1500"),
+    "tiles.max_observations": ("none", "10000 or more"),
+    "tiles.by": ("space", "space, flight-line"),
     "workers.max_memory": ("0.8", ""),
     "verify.max_median_px": ("1", "0.1 to 5"),
     "verify.min_inlier_rate": ("0.9", "0.5 to 1"),

@@ -14,3 +14,4 @@ from ._stages import (
     STAGES as STAGES,
     default_settings as default_settings,
 )
+from ._tiles import Tiles as Tiles

@@ -8,4 +8,5 @@ from ._recorded import Recorded as Recorded, recorded as recorded
 from ._reference import reference_facts as reference_facts
 from ._status import Status as Status, project_settings as project_settings, status as status
 from ._summary import summary as summary, told_of as told_of
+from ._tiles_picture import draw_tiles as draw_tiles
 from ._told import Told as Told

@@ -57,9 +57,33 @@ def test_a_bad_change_says_what_is_allowed(text, message):
         changed(PIPELINE.settings, [text])
 
 
-@pytest.mark.parametrize("text", ["tiles.chunk_size=200", "tiles.overlap=40"])
-def test_what_would_have_no_effect_is_refused(text):
-    with pytest.raises(JaxbaError, match=rf"{text}: blocks are solved whole so far, whatever their size; leave"):
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("tiles.chunk_size=200", 200),
+        ("tiles.overlap=40", 40),
+        ("tiles.max_observations=2e6", 2e6),
+        ("tiles.by=flight-line", "flight-line"),
+    ],
+)
+def test_tiles_can_be_set_and_say_whom_they_are_for(text, value):
+    name = text.split("=")[0]
+    assert getattr(changed(PIPELINE.settings, [text])["tiles"], name.split(".")[1]) == value
+    meanings = {row[0]: row[3] for row in explained(PIPELINE.settings)}
+    assert meanings[name].startswith("for jaxba partition")  # a run does not cut blocks yet
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("tiles.chunk_size=50", "tiles.chunk_size=50 is out of range; allowed: 100 to 5000"),
+        ("tiles.overlap=5", "tiles.overlap=5 is out of range; allowed: 10 to 1500"),
+        ("tiles.max_observations=100", "tiles.max_observations=100.0 is out of range; allowed: 10000 or more"),
+        ("tiles.by=time", "allowed: space, flight-line"),
+    ],
+)
+def test_tiles_out_of_range_are_refused(text, message):
+    with pytest.raises(JaxbaError, match=message):
         changed(PIPELINE.settings, [text])
 
 

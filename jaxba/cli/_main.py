@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -59,16 +59,65 @@ def main(argv: Sequence[str] | None = None) -> None:
     sys.exit(code or 0)
 
 
-@app.command(help=f"Adjust a problem, print a summary, write the adjusted tile.\n\n{_EXIT_CODES}")
+@app.command(
+    help="Adjust a problem, print a summary, write the adjusted tile. Several files are a batch, each a problem of its "
+    "own; what is solved already is not solved again.\n\n" + _EXIT_CODES
+)
 def solve(
     file: _Problem,
     /,
-    *,
+    *more: Annotated[Path, Parameter(help="More of them: tiles/*.npz.")],
     options: Annotated[SolveOptions | None, Parameter(name="*")] = None,
 ) -> int:
+    if more:
+        from jaxba.cli._solve_batch import run as run_batch
+
+        return run_batch((file, *more), options or SolveOptions())
     from jaxba.cli._solve import run
 
     return run(file, options or SolveOptions())
+
+
+@app.command(
+    help="Cut a block into tiles that overlap: writes tiles/tile_000.npz and so on, and a picture of them.\n\n"
+    "Exit codes: 0 written, 2 bad input or options."
+)
+def partition(
+    file: _Problem,
+    /,
+    *,
+    max_observations: Annotated[
+        float | None, Parameter(help="Observations of a tile's own images, in place of --max-images: 2e6.")
+    ] = None,
+    max_images: Annotated[
+        int | None, Parameter(help="Images of its own that a tile has at most. [default: tiles.chunk_size, 500]")
+    ] = None,
+    by: Annotated[
+        Literal["space", "flight-line"] | None,
+        Parameter(help="Cut where few images see across, or at the ends of flight lines. [default: tiles.by, space]"),
+    ] = None,
+    overlap: Annotated[
+        int | None,
+        Parameter(help="Images that a tile takes over from its neighbours. [default: tiles.overlap, 50]"),
+    ] = None,
+    out: Annotated[
+        Path | None, Parameter(help="The folder to write. [default: tiles beside FILE, or in the project]")
+    ] = None,
+    json: _Json = False,
+    quiet: Annotated[bool, Parameter(negative="", show_default=False, help="Print no summary.")] = False,
+) -> int:
+    from jaxba.cli._partition import run
+
+    return run(
+        file,
+        max_observations=max_observations,
+        max_images=max_images,
+        by=by,
+        overlap=overlap,
+        out=out,
+        as_json=json,
+        quiet=quiet,
+    )
 
 
 @app.command(

@@ -85,8 +85,8 @@ class SolveOptions:
     out: Annotated[
         Path | None,
         Parameter(
-            help="Output: a tile, or BAL text where it ends in .txt or .txt.bz2. [default: NAME.solved.npz beside "
-            "FILE, or beside the export that FILE lies in]"
+            help="Output: a tile, or BAL text where it ends in .txt or .txt.bz2; of several files a folder. [default: "
+            "NAME.solved.npz beside FILE, or beside the export that FILE lies in]"
         ),
     ] = None
     json: Annotated[

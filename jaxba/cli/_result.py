@@ -1,7 +1,9 @@
-"""What `jaxba solve` tells: the facts of a run (its `--json`), and a summary of them in words."""
+"""What `jaxba solve` tells: the facts of a run (its `--json`), and a summary of them in words; also of several runs."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +15,7 @@ from jaxba.geometry import AbstractLoss, Linear
 
 _HEAVY_TAIL = 3.0  # rms over median of the errors; 1.2 without outliers, 8 with 2% of them under least squares
 _LARGE_MEDIAN_PX = 3.0
-_MOST_BOUNDS = 6
+_MOST_BOUNDS, _MOST_FILES = 6, 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,3 +197,38 @@ def _refined(run: Run) -> str:
     if not texts:
         return "all fixed"
     return ("" if run.problem.num_cameras == 1 else "medians: ") + ", ".join(texts)
+
+
+def batch_summary(told: dict[str, Any]) -> str:
+    """Return in words what became of all files."""
+    entries, num_files = told["files"], told["num_files"]
+    by_state = {state: [e for e in entries if e["state"] == state] for state in ("solved", "done already", "failed")}
+    states = [f"{len(of_state)} {state}" for state, of_state in by_state.items() if of_state]
+    left, passed_over = num_files - len(entries), len(told["passed_over"])
+    there = [entry for entry in entries if "error" not in entry]
+    not_converged = [f"{entry['input']} ({entry['result']})" for entry in there if not entry["converged"]]
+    solved = by_state["solved"]
+    medians = [entry["median_error_px"] for entry in solved]
+    notes = {
+        name: [f"{entry['input']}: {text}" for entry in solved for text in entry[name]] for name in ("hints", "dropped")
+    }
+    outputs = [entry["output"] for entry in there]
+    return table(
+        (
+            ("files", f"{num_files}: {', '.join([*states, *([f'{left} left'] if left else [])])}"),
+            ("passed over", f"{many(passed_over, 'result')} of other files" if passed_over else []),
+            ("converged", f"{len(there) - len(not_converged)} of {len(there)}" if there else []),
+            ("not", first_of(not_converged, _MOST_FILES) if not_converged else []),
+            ("failed", first_of([entry["input"] for entry in by_state["failed"]], _MOST_FILES) or []),
+            ("look at", _first(notes["hints"])),
+            ("left out", _first(notes["dropped"])),
+            ("errors", f"medians of {min(medians):.3f} to {max(medians):.3f} px" if medians else []),
+            ("seconds", f"{told['seconds_total']:.1f}"),
+            ("written", first_of(outputs, 2) if outputs else []),
+        )
+    )
+
+
+def _first(texts: Sequence[str]) -> list[str]:
+    more = [f"... {len(texts) - _MOST_FILES} more (--json has all)"] if len(texts) > _MOST_FILES else []
+    return [*texts[:_MOST_FILES], *more]

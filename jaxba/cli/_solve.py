@@ -6,7 +6,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,9 @@ from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.engine._project import EXPORT, is_project
 from jaxba.geometry import LOSSES, AbstractLoss, Barron
 from jaxba.io import (
-    read_problem,
+    place_of,
+    problem_of_bytes,
+    read_bytes,
     refuse_same_file,
     refuse_unwritable,
     what_bal_cannot_hold,
@@ -38,18 +40,18 @@ _KINDS = ("intrinsics", "poses", "points")
 def run(file: Path, options: SolveOptions) -> int:
     """Adjust the problem in a file, write the result, print it; return the exit code."""
     loss, bounds = make_loss(options), parse_bounds(options.bounds)
-    _check_numbers(options)
+    check_numbers(options)
     file = tile_of(file)
     out = options.out or default_output(file)
     refuse_same_file(file, out)
-    given = read_problem(file)
+    given, extras = problem_of_bytes(read_bytes(file), str(file))
     problem = fix(given, options.fix).bound(**bounds)
     _check_output(out, given)
     use_compilation_cache()
     begin = time.perf_counter()
     found = _adjust(problem, loss, options)
     seconds = time.perf_counter() - begin
-    _write(out, given, problem, found)
+    _write(out, given, problem, found, extras)
     done = Run(file, out, given, problem, found, loss, options, seconds)
     if options.json:
         print(to_json(facts(done)))
@@ -149,7 +151,7 @@ def default_output(file: Path) -> Path:
     return folder / f"{name or file.name}.solved.npz"
 
 
-def _check_numbers(options: SolveOptions) -> None:
+def check_numbers(options: SolveOptions) -> None:
     """Refuse what could only end in nonsense, before anything is computed."""
     if options.max_nfev < 1:
         raise JaxbaError(f"--max-nfev {options.max_nfev}: give 1 or more.")
@@ -199,19 +201,27 @@ def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Reje
             settings |= {"solver": solve_tiled, "max_memory": options.max_memory}
         else:
             settings |= {"method": options.method, "linear_solver": options.linear_solver}
-        asked = _ROUNDS if options.rounds is None else options.rounds
-        rounds = asked if options.reject else 0
-        return solve_and_reject(problem, rounds=rounds, mad_factor=options.mad_factor, **settings)
+        return solve_and_reject(problem, rounds=rounds_of(options), mad_factor=options.mad_factor, **settings)
 
 
-def _write(out: Path, given: Problem, problem: Problem, found: Rejected) -> None:
+def rounds_of(options: SolveOptions) -> int:
+    """Return how many rounds of rejection were asked for at most."""
+    asked = _ROUNDS if options.rounds is None else options.rounds
+    return asked if options.reject else 0
+
+
+def _write(out: Path, given: Problem, problem: Problem, found: Rejected, extras: Mapping[str, np.ndarray]) -> None:
     """Write the solution: a tile, with what the options fixed and bounded, or BAL text, which has no room for that."""
     if out.name.endswith(_BAL_ENDINGS):
         write_bal(out, found.solution.apply(given))
         return
-    extras = {
+    write_tile(out, found.solution.apply(problem), extras=place_of(extras) | judged(found))
+
+
+def judged(found: Rejected) -> dict[str, np.ndarray]:
+    """Return how the observations came out, as extras of a solved tile."""
+    return {
         "error_px": found.quality.error_px,
         "is_inlier": np.asarray(found.quality.is_inlier),
         "is_used": np.asarray(found.used),
     }
-    write_tile(out, found.solution.apply(problem), extras=extras)

@@ -156,7 +156,7 @@ def test_interrupt_before_the_first_step_writes_nothing(cli: Cli, tile: Path, mo
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_solve, "read_problem", interrupt)
+    monkeypatch.setattr(_solve, "problem_of_bytes", interrupt)
     assert cli("solve", tile) == (130, "", "jaxba: interrupted; nothing was written.\n")
     assert os.listdir(tile.parent) == ["tile.npz"]
 

@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import functools
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +71,19 @@ def test_a_solved_tile_keeps_its_place(paths: list[Path], tmp_path: Path) -> Non
     found = read_tiles([paths[0], solved, *paths[2:]], _block())
     np.testing.assert_array_equal(found[1].tile.problem.points, moved.points)
     assert "error_px" not in place_of(extras) and len(place_of(extras)) == 11
+
+
+def test_the_extras_of_a_tile_are_those_that_the_readme_tells(paths: list[Path]) -> None:
+    text = (Path(jaxba.io.__file__).parent / "README.md").read_text(encoding="utf-8")
+    section = text.split("## Tiles of a block\n")[1].split("\n## ")[0]
+    with np.load(paths[0]) as arrays:
+        extras = {name for name in arrays.files if name.startswith("extra_")}
+        for line in section.splitlines():
+            names = re.findall(r"`(extra_tile_\w+)`", line)
+            for name in names if line.startswith("|") else ():
+                shape = re.search(r"\| \(([a-z]*),?\) \|", line)
+                assert shape is not None and (arrays[name].ndim == 1) == bool(shape[1])
+    assert set(re.findall(r"`(extra_tile_\w+)`", section)) == extras
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,7 @@ def run(
             f"--max-images {max_images} and --max-observations {max_observations:g}: a tile has one size; give one."
         )
     settings = _settings(file, quiet=quiet or as_json)
+    name = file.resolve().name
     file = tile_of(file)
     if max_images is None and max_observations is None:
         max_observations = settings.max_observations
@@ -60,7 +61,7 @@ def run(
         "of_other_partitions": [str(path) for path in solved_before(paths)],
     }
     with write_atomically(out / _PICTURE) as stream:
-        stream.write(draw_tiles(found, f"{file.name}: {_title(told)}", _subtitle(told)))
+        stream.write(draw_tiles(found, f"{name}: {_title(told)}", _subtitle(told)))
     if as_json:
         print(to_json(told))
     elif not quiet:

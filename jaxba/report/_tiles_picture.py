@@ -41,7 +41,7 @@ def _draw(figure: "Figure", partition: Partition, title: str, subtitle: str) -> 
     cameras, points = camera_centers(block.poses)[:, :2], np.asarray(block.points, float)
     colours = _rgb(np.array(_COLOURS)[_colour_of_tile(partition)])
     box = box_of(points[:, :2], cameras)
-    titles(figure, title, f"{subtitle}; ringed cameras are in several tiles, dark points are cut")
+    titles(figure, title, f"{subtitle}; ringed cameras are in several tiles, dark points are seen from several")
     width, height = fitting(box, 950.0, 715.0)
     ground = axes_at(figure, (100, 70, width, height))
     _draw_ground(ground, partition, points, colours, box)

@@ -192,7 +192,7 @@ def _refuse_small(problem: Problem, own: Int[np.ndarray, " tiles"], size: _Size,
     if overlap >= typical:
         raise JaxbaError(
             f"partition: overlap {overlap}: the tiles have {typical} images of their own (median), and fewer must "
-            f"overlap. Give an overlap such as {typical // 4}, or larger tiles."
+            f"overlap. Give an overlap such as {max(typical // 4, 1)}, or larger tiles."
         )
 
 

@@ -226,7 +226,7 @@ class _Dissection:
                 (np.ones(np.count_nonzero(near), np.int32), (image[near], point[near])),
                 shape=(len(size), len(self.tile_of_point)),
             )
-            stays, joins = _cover(sparse.csr_array(sees[across] @ sees[beyond].T))
+            stays, joins = _cover(sparse.csr_array(sees[across] @ sees[beyond].T), len(beyond))
             if np.count_nonzero(stays) + np.count_nonzero(joins) >= len(across):
                 continue
             side[across[~stays]], side[beyond[joins]] = -other, 0
@@ -258,12 +258,12 @@ class _Dissection:
         return images[np.argsort(centers @ np.linalg.svd(centers.T @ centers)[0][:, 0], kind="stable")]
 
 
-def _cover(pairs: sparse.csr_array) -> tuple[Bool[np.ndarray, " rows"], Bool[np.ndarray, " columns"]]:
+def _cover(pairs: sparse.csr_array, num_columns: int) -> tuple[Bool[np.ndarray, " rows"], Bool[np.ndarray, " columns"]]:
     """Return the fewest rows and columns that hold all entries of a matrix (König 1931)."""
     column_of = maximum_bipartite_matching(pairs, perm_type="column")
-    row_of = np.full(pairs.shape[1], -1)
+    row_of = np.full(num_columns, -1)
     row_of[column_of[column_of >= 0]] = np.flatnonzero(column_of >= 0)
-    rows, columns = column_of >= 0, np.zeros(pairs.shape[1], bool)
+    rows, columns = column_of >= 0, np.zeros(num_columns, bool)
     while np.any(new := (pairs.T @ (~rows).astype(np.int32) > 0) & ~columns):
         columns |= new  # has a row each, or there were a larger matching
         rows[row_of[new]] = False

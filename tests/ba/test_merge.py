@@ -183,7 +183,7 @@ def test_the_pass_is_that_of_the_block_with_all_else_held() -> None:
     problem, _, once, whole = _merged()
     assert whole.solutions[1].report is not None
     assert whole.solutions[1].report.problem.num_observations < problem.num_observations
-    first = jaxba.solve(once.problem.fix(poses=True), ftol=1e-13, xtol=1e-13).apply(problem)
+    first = jaxba.solve(once.problem.fix(poses=True, intrinsics=True), ftol=1e-13, xtol=1e-13).apply(problem)
     seen = problem.observations
     moves = np.unique(seen.point_index[once.shared[seen.image_index]])
     assert 3 <= np.count_nonzero(once.shared) < 24 and len(moves) < problem.num_points

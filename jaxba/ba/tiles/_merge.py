@@ -4,8 +4,8 @@
 2. **Values.** Images and points that several tiles have get the mean of what these say, by the observations that each
    has of them; rotations a mean of matrices. Cameras and the lever arm likewise. A tile that contradicts the one with
    most observations has no part in a mean. Points that no tile has are intersected from the merged images.
-3. **A pass over the block** (`_global_pass.py`): points and what all share with every image held, then the images of
-   several tiles with the points that they see.
+3. **A pass over the block** (`_global_pass.py`): all points with every image held, then the images where tiles meet
+   with the points that they see.
 
 What it costs beside an exact adjustment: a tile knows nothing of what lies beyond it, so its cameras, its tilt and its
 bends are its own, and a similarity takes out seven of these unknowns. `solve_tiled` gives the answer of the block in
@@ -58,8 +58,9 @@ class Merged:
     - `std_m`: by how much tiles differ at shared centres and points, sigma an axis.
     - `num_contradictions`: values of a tile that had no part in a mean, as another tile with more observations is far.
     - `intersected`, `untouched`: points that no tile has, from merged images or, where these tell nothing, as given.
-    - `shared`: free images of several tiles, and those that see a point whose images no tile has together.
-    - `solutions`: of the global pass, none without it: of points and what all share, then of the shared images. The
+    - `shared`: free images where tiles meet: those of several tiles, and those that see a point whose images no tile
+      has together (none where tiles overlap widely).
+    - `solutions`: of the global pass, none without it: of the points, then of the shared images and their points. The
       last is of a part of the block, which its report holds.
     """
 
@@ -110,7 +111,7 @@ def merge_tiles(
     """Merge tiles that were adjusted each on its own into the block that they were cut from.
 
     - `problem`: the block. `tiles`: its tiles, their problems with adjusted values (`solution.apply(tile.problem)`).
-    - `global_pass`: whether the block is adjusted at last: points and what all share, then the images of several tiles.
+    - `global_pass`: whether the block is adjusted at last: its points, then the images where tiles meet.
     - `loss`, `max_nfev`, `ftol`, `xtol`, `gtol`: of this pass, as in `solve`.
 
     The frame is the block's where its priors, or what is held fixed, place a tile; else that of the tile with most

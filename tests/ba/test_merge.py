@@ -213,6 +213,20 @@ def test_large_blocks_take_the_pass_in_tiles(monkeypatch: pytest.MonkeyPatch) ->
     _assert_values(tiled.problem, eqx.tree_at(lambda p: p.cameras, whole.problem, tiled.problem.cameras), 1e-6)
 
 
+def test_a_camera_of_shared_images_alone_is_adjusted_with_them() -> None:
+    # breaks where an image has a camera of its own, and keeps the mean of what its tiles say of it
+    block = _truth(gnss=True, num_cameras=24)
+    tiles = _cut(block, _GROUPS)
+    for number, tile in enumerate(tiles):
+        fx = np.array(tile.problem.cameras.fx)
+        fx[tile.images == 11] += 2.0
+        spoilt = eqx.tree_at(lambda p: p.cameras.fx, tile.problem, fx)
+        tiles[number] = dataclasses.replace(tile, problem=spoilt)
+    merged = jaxba.merge_tiles(block, tiles)
+    assert merged.shared[11]
+    np.testing.assert_allclose(merged.problem.cameras.fx, block.cameras.fx, rtol=0, atol=1e-2)
+
+
 def test_what_is_held_fixed_stays() -> None:
     # breaks where a mean, an intersection or the pass writes over it
     problem, _, once, whole = _merged()

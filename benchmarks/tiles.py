@@ -7,10 +7,10 @@ seconds a step (medians over all steps but the first), the peak of memory, and h
 `--sizes`: images of the blocks. `--limited`: which of them are solved under `--max-memory` as well. `--whole`: which of
 them are solved in one piece as well. `--shapes`: in place of all that, blocks of other shapes beside square ones.
 
-`--merge`: in place of all that, what it costs to adjust tiles each on its own and merge them. The same block of 400 images,
-with GNSS, and with control points as well, is adjusted exactly (`solve_tiled`), and in 4 and 9 tiles that are merged
-(`merge_tiles`), with and without the global pass. Prints the cost over the exact one, rms distances of camera centres
-and points from the exact ones and of check points from the truth, and the seconds of a second run.
+`--merge`: in place of all that, what it costs to adjust tiles each on its own and merge them. The same block of 400
+images, with GNSS, and with control points as well, is adjusted exactly, and in 4 and 9 tiles that are merged, with and
+without the global pass. Prints the cost over the exact one, rms distances of camera centres and points from the exact
+ones and of check points from the truth, and the seconds of a second run.
 """
 
 import argparse

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 import jaxba
 from jaxba import BlockTile, JaxbaError, Merged, Pose, Problem
-from jaxba.ba.tiles import _global_pass
 from jaxba.ba.tiles._cut import sub_problem
 from jaxba.geometry import Similarity
 
@@ -203,14 +202,6 @@ def test_the_exact_adjustment_is_better_than_what_was_merged() -> None:
     assert _cost(whole.problem) < 1.1 * exact.final_cost < _cost(once.problem)
     again = jaxba.solve(whole.problem)
     np.testing.assert_allclose(again.final_cost, exact.final_cost, rtol=1e-7)  # ftol
-
-
-def test_large_blocks_take_the_pass_in_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, solved, _, whole = _merged()
-    monkeypatch.setattr(_global_pass, "_LARGE", 2)
-    tiled = jaxba.merge_tiles(problem, solved, ftol=1e-13, xtol=1e-13)
-    assert tiled.solutions[0].report is not None and tiled.solutions[0].report.linear_solver == "tiles"
-    _assert_values(tiled.problem, eqx.tree_at(lambda p: p.cameras, whole.problem, tiled.problem.cameras), 1e-6)
 
 
 def test_a_camera_of_shared_images_alone_is_adjusted_with_them() -> None:

@@ -14,7 +14,7 @@ gains 0.1% of the cost and takes the focal length away from the exact one, since
 them pull at it: from 0.1 to 0.6 px in this block, and check points from 0.025 to 0.034 m off the truth.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -33,10 +33,8 @@ from jaxba.ba._solve import solve
 from jaxba.ba._system import own_unknowns
 from jaxba.ba.tiles._cut import sub_problem
 from jaxba.ba.tiles._partition import BlockTile
-from jaxba.ba.tiles._solve_tiled import solve_tiled
 from jaxba.geometry import AbstractCamera, AbstractLoss
 
-_LARGE = 1000  # images: from here on `solve_tiled` is faster
 _CHUNK = 4096
 _LEAST_ANGLE = 1e-3  # radians: rays that are more parallel fix no depth
 
@@ -60,7 +58,7 @@ def shared_images(problem: Problem, tiles: Sequence[BlockTile]) -> Bool[np.ndarr
 def adjust_points(problem: Problem, loss: AbstractLoss, stops: dict[str, Any]) -> Solution | None:
     """Return the block's solution with all but points held; None where no point is free."""
     held = _held(problem.fix(poses=True), True)
-    return _solver(held)(held, loss=loss, **stops) if np.any(held.free.points) else None
+    return solve(held, loss=loss, **stops) if np.any(held.free.points) else None
 
 
 def adjust_shared(
@@ -85,7 +83,7 @@ def adjust_shared(
     part = sub_problem(problem, rows, images, points, cameras, of_priors)
     part = part.fix(poses=~free_images[images], points=~free_points[points])
     part = _held(part, np.broadcast_to(~free_cameras[cameras][:, None], part.lower.shape))
-    solution = _solver(part)(part, loss=loss, **stops)
+    solution = solve(part, loss=loss, **stops)
     values = own_unknowns(problem)
     values.poses.quaternion[images] = solution.poses.quaternion
     values.poses.translation[images] = solution.poses.translation
@@ -99,10 +97,6 @@ def adjust_shared(
 def _held(problem: Problem, intrinsics: Selection) -> Problem:
     """Return the problem with these intrinsics and the lever arm held."""
     return eqx.tree_at(lambda p: p.free.lever_arm, problem.fix(intrinsics=intrinsics), np.array(False))
-
-
-def _solver(problem: Problem) -> Callable[..., Solution]:
-    return solve_tiled if problem.num_images > _LARGE else solve
 
 
 def _rows_of_free(prior: AbstractPrior, free: dict[str, Bool[np.ndarray, " _"]]) -> Int[np.ndarray, " rows"]:

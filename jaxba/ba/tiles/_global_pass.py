@@ -7,11 +7,12 @@
    images and of free points, and the rows of priors of what is free. All other rows are constants.
 
 So the cost of the block falls in each by what the cost of its problem falls. For 400 images in 9 tiles the means cost
-2.9 times what the exact adjustment does; after 1 it is 1.42, after 2 1.01 (`python -m benchmarks.tiles --merge`).
+2.7 times what the exact adjustment does, and 1.01 times after the pass (`python -m benchmarks.tiles --merge`).
 
 Intrinsics and the lever arm keep the means of the tiles, but for cameras that free images alone have. To free them in 1
 gains 0.1% of the cost and takes the focal length away from the exact one, since images that are held as their tiles had
-them pull at it: from 0.1 to 0.6 px in this block, and check points from 0.025 to 0.034 m off the truth.
+them pull at it: from 0.1 to 0.6 px in such a block, and check points from 0.025 to 0.034 m off the truth (no command is
+kept).
 """
 
 from collections.abc import Sequence

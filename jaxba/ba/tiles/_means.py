@@ -3,7 +3,7 @@
 Each tile counts by the observations that it has of the thing: an image at the rim of a tile shows few of its points
 there, and is known less than in the tile that has it in its middle. (To take each image from its own tile alone leaves
 steps at the seams: of 400 images in 9 tiles the cost is 1.68 times the exact one then, once points have followed, and
-1.55 with means.) Rotations get the mean of least squares over their
+1.55 with means; no command is kept.) Rotations get the mean of least squares over their
 matrices. Where a tile lies far from the one with most observations, it has no part in the mean.
 """
 

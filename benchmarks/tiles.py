@@ -6,9 +6,15 @@ seconds a step (medians over all steps but the first), the peak of memory, and h
 
 `--sizes`: images of the blocks. `--limited`: which of them are solved under `--max-memory` as well. `--whole`: which of
 them are solved in one piece as well. `--shapes`: in place of all that, blocks of other shapes beside square ones.
+
+`--merge`: in place of all that, what it costs to adjust tiles each on its own and merge them. The same block of 400
+images, with GNSS, and with control points as well, is adjusted exactly, and in 4 and 9 tiles that are merged, with and
+without the global pass. Prints the cost over the exact one, rms distances of camera centres and points from the exact
+ones and of check points from the truth, and the seconds of a second run.
 """
 
 import argparse
+import dataclasses
 import itertools
 import json
 import math
@@ -18,12 +24,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import jaxba
+from jaxba import Problem
+from jaxba.simulation.synthetic import Truth
 
 _SHAPES: dict[str, dict[str, Any]] = {
     "square": {"num_images": 1000},
@@ -45,6 +55,7 @@ def main() -> None:
     parser.add_argument("--whole", type=int, nargs="*", default=[1000, 4000])
     parser.add_argument("--max-memory", default="4GB")
     parser.add_argument("--shapes", action="store_true")
+    parser.add_argument("--merge", action="store_true")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -52,6 +63,9 @@ def main() -> None:
         return
     if options.shapes:
         _shapes()
+        return
+    if options.merge:
+        _merge()
         return
     print("| images | observations | way | set-up (s) | a step (s) | steps | result | peak of memory (GB) |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
@@ -136,6 +150,61 @@ def _one(way: str, file: str, options: str) -> None:
 def _peak() -> float:
     """Return the most bytes that this process has held."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
+
+
+def _merge() -> None:
+    """Print the table of merged tiles beside the exact adjustment; their seconds hold the solves and the merge."""
+    jax.config.update("jax_enable_x64", True)
+    print("| priors | tiles | overlap | way | images in pass | cost over exact | centres (m) | points (m) |", end="")
+    print(" check points (m) | seconds | compiling (s) |\n|" + 11 * " --- |")
+    for priors, num_control in (("GNSS", 0), ("GNSS, control", 8)):
+        survey = jaxba.synthetic.uav_block(400, side_overlap=0.7, num_control=num_control, num_check=50)
+        problem, truth = survey.problem, survey.truth
+        exact, *seconds = _timed(lambda problem=problem: jaxba.solve_tiled(problem).apply(problem))
+        _print_merged(f"{priors} | | | `solve_tiled` | ", exact, exact, truth, seconds)
+        whole, *seconds = _timed(lambda problem=problem: jaxba.solve(problem).apply(problem))
+        _print_merged(f"{priors} | | | `solve` | ", whole, exact, truth, seconds)
+        for num_tiles, overlap in ((4, 10), (4, 50), (9, 10), (9, 40)):
+            tiles = jaxba.partition(problem, max_images=math.ceil(400 / num_tiles), overlap=overlap).tiles
+            assert len(tiles) == num_tiles
+            solutions, *of_tiles = _timed(lambda tiles=tiles: jaxba.solve_batch([tile.problem for tile in tiles]))
+            done = [
+                dataclasses.replace(tile, problem=solution.apply(tile.problem))
+                for tile, solution in zip(tiles, solutions, strict=True)
+            ]
+            for way, global_pass in (("similarity", False), ("and global pass", True)):
+                merged, *seconds = _timed(lambda: jaxba.merge_tiles(problem, done, global_pass=global_pass))  # noqa: B023
+                total = [a + b for a, b in zip(of_tiles, seconds, strict=True)]
+                label = f"{priors} | {num_tiles} | {overlap} | {way} | {merged.shared.sum() if global_pass else ''}"
+                _print_merged(label, merged.problem, exact, truth, total)
+
+
+def _timed(call: Callable[[], Any]) -> tuple[Any, float, float]:
+    """Return what a call returns, the seconds of a second call, and by how much the first one took longer."""
+    begun = time.perf_counter()
+    call()
+    middle = time.perf_counter()
+    found = call()
+    end = time.perf_counter()
+    return found, end - middle, max(0.0, (middle - begun) - (end - middle))
+
+
+def _print_merged(label: str, found: Problem, exact: Problem, truth: Truth, seconds: list[float]) -> None:
+    def rms(difference: Any) -> float:
+        return float(np.sqrt(np.mean(np.sum(np.asarray(difference) ** 2, axis=1))))
+
+    seen_twice = np.bincount(np.asarray(exact.observations.point_index), minlength=exact.num_points) > 1
+    check = truth.check_index
+    apart = found.poses.center - exact.poses.center, (found.points - exact.points)[seen_twice]
+    figures = [_cost(found) / _cost(exact), *map(rms, apart), rms(found.points[check] - truth.points[check])]
+    print(f"| {label} |", *(f"{figure:.4f} |" for figure in figures), *(f"{one:.1f} |" for one in seconds), flush=True)
+
+
+def _cost(problem: Problem) -> float:
+    seen = problem.observations
+    errors = jaxba.reprojection_errors(problem) / np.asarray(seen.std_px)
+    unknowns = jaxba.ba.Unknowns(problem.poses, problem.cameras.parameters, problem.lever_arm, problem.points)
+    return 0.5 * float(np.sum(errors**2) + sum(np.sum(prior.residual(unknowns) ** 2) for prior in problem.priors))
 
 
 if __name__ == "__main__":

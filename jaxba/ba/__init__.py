@@ -26,6 +26,7 @@ from jaxba.ba.groups import (
     PositionPrior,
 )
 from jaxba.ba.tiles._batch import solve_batch
+from jaxba.ba.tiles._merge import Merged, MergedTile, merge_tiles
 from jaxba.ba.tiles._partition import BlockTile, Partition, partition
 from jaxba.ba.tiles._solve_tiled import solve_tiled
 
@@ -46,6 +47,8 @@ __all__ = [
     "IntrinsicsPrior",
     "JacobianBlock",
     "LeverArmPrior",
+    "Merged",
+    "MergedTile",
     "Observations",
     "Partition",
     "Plan",
@@ -68,6 +71,7 @@ __all__ = [
     "fast_jit",
     "free_gauge",
     "make_plan",
+    "merge_tiles",
     "partition",
     "prepare",
     "project_in_cameras",

@@ -38,12 +38,14 @@ from jaxba.geometry._rotation import (
     so3_left_jacobian_inverse,
     so3_log,
 )
+from jaxba.geometry._similarity import Similarity, umeyama
 from jaxba.geometry._triangulate import Triangulation, refine_point, triangulate, triangulate_two_view
 
 __all__ = [
     "BAL", "CAMERAS", "LOSSES", "AbstractCamera", "AbstractLoss", "Arctan", "Barron", "Cauchy", "GemanMcClure", "Huber",
-    "Linear", "OpenCV", "OpenCVFisheye", "Pinhole", "Pose", "Radial", "SimplePinhole", "SimpleRadial", "SoftL1",
-    "Triangulation", "Tukey", "check_loss", "hat", "matrix_from_quaternion", "quaternion_conjugate", "quaternion_exp",
-    "quaternion_from_matrix", "quaternion_log", "quaternion_multiply", "refine_point", "require_number", "se3_exp",
-    "se3_log", "so3_exp", "so3_left_jacobian_inverse", "so3_log", "triangulate", "triangulate_two_view",
+    "Linear", "OpenCV", "OpenCVFisheye", "Pinhole", "Pose", "Radial", "Similarity", "SimplePinhole", "SimpleRadial",
+    "SoftL1", "Triangulation", "Tukey", "check_loss", "hat", "matrix_from_quaternion", "quaternion_conjugate",
+    "quaternion_exp", "quaternion_from_matrix", "quaternion_log", "quaternion_multiply", "refine_point",
+    "require_number", "se3_exp", "se3_log", "so3_exp", "so3_left_jacobian_inverse", "so3_log", "triangulate",
+    "triangulate_two_view", "umeyama",
 ]  # fmt: skip

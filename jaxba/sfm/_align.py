@@ -17,27 +17,12 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from jaxba.geometry import Similarity, umeyama
+
 _SAMPLES = 300
 _LOSS = 2.0  # sigmas
 _DOWN_STD = 0.05  # radians; mean viewing direction against the vertical where no attitude is known
 _LEAST_ATTITUDE_STD = 0.02  # radians
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Similarity:
-    """`X_local = scale * rotation @ X + shift`."""
-
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
-
-    def points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return points, or centres, in the local frame."""
-        return self.scale * points @ self.rotation.T + self.shift
-
-    def rotations(self, rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
-        """Return `cam_from_local`."""
-        return rotations @ self.rotation.T
 
 
 def align(
@@ -173,27 +158,14 @@ class _Measured:
                 if self.attitude is not None:
                     found.append(self._shifted(abs(ratio), self.attitude, [i, j]))
             if k != i and np.all(self.weight[[i, j, k]] > 0):
-                found += self._from_three([i, j, k])
+                similarity = umeyama(self.center[[i, j, k]], self.xyz[[i, j, k]])
+                found += [] if similarity is None else [similarity]
         return found
 
     def _shifted(self, scale: float, rotation: Float[np.ndarray, "3 3"], sample: list[int]) -> Similarity:
         shift = self.xyz - scale * self.center @ rotation.T
         horizontal, vertical = shift[sample, :2].mean(axis=0), np.median(shift[:, 2])
         return Similarity(scale=scale, rotation=rotation, shift=np.array([*horizontal, vertical]))
-
-    def _from_three(self, sample: list[int]) -> list[Similarity]:
-        """Umeyama 1991, on three positions."""
-        source, target = self.center[sample], self.xyz[sample]
-        p, q = source - source.mean(axis=0), target - target.mean(axis=0)
-        u, s, vt = np.linalg.svd(q.T @ p)
-        if s[1] < 1e-3 * s[0]:  # on a line
-            return []
-        sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
-        rotation, scale = u @ (sign[:, None] * vt), float((s * sign).sum() / (p * p).sum())
-        if not scale > 0:
-            return []
-        shift = target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
-        return [Similarity(scale=scale, rotation=rotation, shift=shift)]
 
     def refine(self, start: Similarity) -> Similarity:
         middle = self.center.mean(axis=0)

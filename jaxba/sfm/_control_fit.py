@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
+from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control, ControlFit, Reference
 from jaxba.sfm._adjust import Adjusted
-from jaxba.sfm._align import Similarity
 from jaxba.sfm._control import LEAST_TO_PLACE, Intersected, intersect, median_offset
 from jaxba.sfm._control_start import determines_tilt, fit_similarity, transformed
 from jaxba.sfm._uncertainty import Uncertainty, own_variance

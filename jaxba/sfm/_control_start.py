@@ -12,8 +12,9 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control
-from jaxba.sfm._align import Similarity, align, look_down
+from jaxba.sfm._align import align, look_down
 from jaxba.sfm._control import LEAST_TO_PLACE, image_rows, intersect
 from jaxba.sfm._initialise import UNPLACED
 from jaxba.sfm._problem import is_collinear

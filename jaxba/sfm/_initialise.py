@@ -21,8 +21,9 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
+from jaxba.geometry import Similarity
 from jaxba.scene import Block, Photo, Reference, Tracks, ViewGraph
-from jaxba.sfm._align import Similarity, align, attitude_rotation, look_down
+from jaxba.sfm._align import align, attitude_rotation, look_down
 from jaxba.sfm._points import with_points
 from jaxba.sfm._positions import choose_tracks, global_positions, largest_angles
 from jaxba.sfm._rays import make_rays

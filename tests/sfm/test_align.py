@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxba.sfm._align import Similarity, align, look_down
+from jaxba.geometry import Similarity
+from jaxba.sfm._align import align, look_down
 
 DOWN = np.diag([1.0, -1, -1])
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from simulated import Simulated, simulate, true_block
 
 from jaxba.ba import make_plan
+from jaxba.geometry import Similarity
 from jaxba.report import sentences
 from jaxba.scene import Control, Finding
 from jaxba.sfm import (
@@ -21,7 +22,6 @@ from jaxba.sfm import (
     uncertainty as uncertainty_of,
     with_points,
 )
-from jaxba.sfm._align import Similarity
 from jaxba.sfm._control import agreeing_marks, control_part, control_scale, intersect
 from jaxba.sfm._control_fit import Controlled, apply_affine, fit_affine
 from jaxba.sfm._control_start import transformed

@@ -128,7 +128,7 @@ def _one(way: str, file: str, options: str) -> None:
     loaded = _peak()
     begun = time.perf_counter()
     if way == "whole":
-        solution = jaxba.solve(problem, max_nfev=10)
+        solution = jaxba.solve(problem, max_nfev=10, linear_solver="banded")
     else:
         solution = jaxba.solve_tiled(problem, max_nfev=10, max_memory=None if way == "tiles" else way)
     assert solution.report is not None  # the problem is concrete

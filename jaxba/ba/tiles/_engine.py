@@ -1,9 +1,10 @@
-"""Steps of a block in tiles: the same as those of the block in one piece, for which no more than a few tiles are held.
+"""The engine of a block in tiles: what goes up the tree and down again, with no more than a few tiles held at a time.
 
-A step goes up the tree and down again. Up: each tile linearises its observations, eliminates its points, then its inner
+Up: each tile linearises its observations, eliminates its points, then its inner
 images, and hands a dense matrix over its boundary to its parent (`_fronts.py`); parents add and eliminate in turn, and
-the root solves for the border, within its bounds. Down: each node solves for its own images, each tile for its points,
-which it refines; what it takes to judge the step is summed, and the solver judges as it does in one piece.
+the root solves for the border, within its bounds. Down: each node solves for
+its own images, each tile for its points. What is done so with what comes down stands in `_step.py` (a step of the
+solver), `_inverse.py` (covariances) and `_reverse.py` (gradients).
 
 Tiles are worked on by `workers` threads, and their results taken in the order of the tree: the same bytes whatever the
 number of threads.
@@ -21,22 +22,19 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.ba._compiler import call_compiled, compile_ahead
-from jaxba.ba._factor import box_minimum
 from jaxba.ba._lengths import MIN_DIAGONAL
 from jaxba.ba._linearise import Linearisation, costs, linearise
 from jaxba.ba._plan_shape import bare_shape
 from jaxba.ba._problem import Problem
-from jaxba.ba._solvers import SchurLevenbergMarquardt, State, Tried, projected_gradient_norm
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.ba.tiles._budget import Budget
 from jaxba.ba.tiles._cut import Tile, cut
-from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._dissect import Tree
 from jaxba.ba.tiles._fronts import Factor, Fronts, TileFronts
-from jaxba.ba.tiles._programs import Handed, Sums, hand_over, put_back
+from jaxba.ba.tiles._programs import Handed, hand_over
 from jaxba.ba.tiles._shelf import Shelf
-from jaxba.geometry import AbstractLoss, Pose
+from jaxba.geometry import AbstractLoss
 
 _T = TypeVar("_T")
 
@@ -65,7 +63,7 @@ class Call(NamedTuple):
 
 
 class Engine:
-    """A problem in tiles, ready for steps.
+    """A problem in tiles.
 
     - `budget`: how much of systems, factors and equations stays in memory. `folder`: for files of the rest.
     - `pool`: threads for the fronts above the tiles.
@@ -106,12 +104,10 @@ class Engine:
         self.tops = [number for number in range(len(tree.nodes)) if number not in below]
         self.tile_of_node = {fronts.last: number for number, (_, fronts) in enumerate(self.tiles)}
 
-    def compile(
-        self, unknowns: Unknowns, calls: Callable[[System, Unknowns, Linearisation], list[Call]] | None = None
-    ) -> None:
+    def compile(self, unknowns: Unknowns, calls: Callable[[System, Unknowns, Linearisation], list[Call]]) -> None:
         """Compile the work on tiles, two programs at a time; without it that happens when it is first done.
 
-        - `calls`: what is called beside the way up, from a tile's system, unknowns and equations: for a step if None.
+        - `calls`: what is called beside the way up, from a tile's system, unknowns and equations.
         """
         one_of_shape = {tile.plan.shape: number for number, (tile, _) in enumerate(self.tiles)}
 
@@ -124,7 +120,7 @@ class Engine:
             for number in one_of_shape.values():
                 system, part, scalar = self.system(number), self.tiles[number][0].take(unknowns), np.zeros(())
                 model = jax.eval_shape(linearise, system, part, scalar)
-                done += (calls or _calls_of_step)(system, part, model)
+                done += calls(system, part, model)
                 done += [Call(hand_over, (system, model, scalar)), Call(linearise, (system, part, scalar))]
             list(pool.map(compile_one, done))
 
@@ -137,31 +133,6 @@ class Engine:
 
         robust, plain = np.sum(list(self.each_tile(of_tile)), axis=0)
         return robust, plain
-
-    def step(self, solver: SchurLevenbergMarquardt, unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
-        """Return the unknowns and the state after a step was tried."""
-        damping, bend = np.asarray(state.trust), np.asarray(state.bend)
-        try:
-            up = self.up(self.step_equations(unknowns, damping, bend), damping)
-        except NotPositive:
-            return unknowns, call_compiled(_judge_with(solver), state, jax.tree.map(np.asarray, _NOTHING_TRIED))
-        trial, sums, squared_norm = self._down(unknowns, self._border(unknowns, up.update), damping, bend)
-        gradient = up.gradient
-        of_all = Step(gradient.poses, gradient.intrinsics, gradient.lever_arm, np.array([[up.steepest, 0.0, 0.0]]))
-        tried = _NOTHING_TRIED | {
-            "cost": sums.cost,
-            "promised": -sums.slope - sums.curvature / 2,
-            "gradient_norm": call_compiled(
-                projected_gradient_norm, self.lower, self.upper, unknowns.intrinsics, of_all
-            ),
-            "shortened": 1 + damping,
-            "in_sigmas": np.sqrt(sums.in_sigmas),
-            "all_in_sigmas": np.sqrt(sums.all_in_sigmas),
-            "norm": np.sqrt(squared_norm),
-            "points_held": int(sums.points_held),
-        }
-        judged = call_compiled(_judge_with(solver), state, jax.tree.map(np.asarray, tried))
-        return (trial if judged.accepted else unknowns), judged
 
     def system(self, number: int) -> System:
         """Return the system of a tile."""
@@ -200,11 +171,11 @@ class Engine:
                     total.lever_arm[:] += part.lever_arm
                 continue
             node = self.tree.nodes[number]
-            images, _ = self._reduced(self._damping(squares, damping), self.camera_index)
+            images, _ = self.reduced(self._damping(squares, damping), self.camera_index)
             handed_on = [updates.pop(child) for child in node.children]
             updates[number] = self._eliminate(number, handed_on, images[node.eliminated], pool=self.pool)
         (top,) = updates.values()
-        images, on_border = self._reduced(self._damping(squares, damping), self.camera_index)
+        images, on_border = self.reduced(self._damping(squares, damping), self.camera_index)
         np.einsum("ii->i", top)[: len(on_border)] += on_border
         return Up(top, gradient, squares, steepest, diagonal + images, of_border + on_border)
 
@@ -233,7 +204,7 @@ class Engine:
             Step(part.poses[:count], part.intrinsics[: len(tile.cameras)], part.lever_arm, part.points)
             for part in (handed.squares, handed.gradient)
         )
-        images, _ = self._reduced(self._damping(squares, damping, tile), np.arange(count))
+        images, _ = self.reduced(self._damping(squares, damping, tile), np.arange(count))
         updates: dict[int, np.ndarray] = {}
         begin = 0
         for node_number, part in zip(range(fronts.first, fronts.last + 1), fronts.parts, strict=True):
@@ -254,72 +225,6 @@ class Engine:
         if not self.shelf.put(("factor", number), factor):
             self.fronts.forget(factor)
         return update
-
-    def _border(self, unknowns: Unknowns, top: Float[np.ndarray, "tail tail"]) -> Float[np.ndarray, " border"]:
-        """Return the border's solution from what the root hands on."""
-        count = self.shape.border
-        if not count:
-            return np.zeros(0)
-        corner = np.tril(top[:count, :count])
-        corner = corner + np.tril(corner, -1).T
-        lower = upper = None
-        if self.shape.any_bound:
-            lower, upper = (
-                self._reduced(
-                    Step(self.free.poses, bound - unknowns.intrinsics, far, self.free.points), self.camera_index
-                )[1]
-                for bound, far in ((self.lower, np.full(3, -np.inf)), (self.upper, np.full(3, np.inf)))
-            )
-        return np.asarray(call_compiled(box_minimum, corner, top[count, :count], lower, upper))
-
-    def _down(
-        self,
-        unknowns: Unknowns,
-        border: Float[np.ndarray, " border"],
-        damping: Float[np.ndarray, ""],
-        bend: Float[np.ndarray, ""],
-    ) -> tuple[Unknowns, Sums, float]:
-        """Return the unknowns after the step, what it is judged by, and its squared length."""
-        solution, tail = self.put_back_tops(border)
-        shared = self._shared_step(unknowns, border)
-        work = functools.partial(self._down_tile, unknowns, solution, tail, shared, damping, bend)
-        trial = Unknowns(
-            Pose(unknowns.poses.quaternion.copy(), unknowns.poses.translation.copy()),
-            unknowns.intrinsics + shared.intrinsics,
-            unknowns.lever_arm + shared.lever_arm,
-            unknowns.points.copy(),
-        )
-        totals = Sums(*[np.zeros(()) for _ in Sums._fields])
-        for (tile, _), (part, sums) in zip(self.tiles, self.each_tile(work), strict=True):
-            tile.put(part, trial)
-            totals = Sums(*[total + own for total, own in zip(totals, sums, strict=True)])
-        if self.shape.own_cameras:
-            refined = np.flatnonzero(self.shape.refined)
-            trial.intrinsics[self.camera_index[:, None], refined] += solution[:, 6:]
-        squared = np.sum(solution**2) + np.sum(shared.intrinsics**2) + np.sum(shared.lever_arm**2) + totals.of_points
-        return trial, totals, float(squared)
-
-    def _down_tile(
-        self,
-        unknowns: Unknowns,
-        solution: Float[np.ndarray, "images block"],
-        tail: Float[np.ndarray, " tail"],
-        shared: Step,
-        damping: Float[np.ndarray, ""],
-        bend: Float[np.ndarray, ""],
-        number: int,
-    ) -> tuple[Unknowns, Sums]:
-        tile, _ = self.tiles[number]
-        images = self.put_back_tile(number, solution, tail)
-        system, part = self.system(number), tile.take(unknowns)
-        model = self.equations(number, part, bend)
-        intrinsics = shared.intrinsics
-        if self.shape.own_cameras:
-            intrinsics = np.zeros(part.intrinsics.shape)
-            intrinsics[:, np.flatnonzero(self.shape.refined)] = images[:, 6:]
-        step = Step(images[:, :6], intrinsics, shared.lever_arm, np.zeros_like(part.points))
-        solved = images, tail[: self.shape.border]
-        return jax.tree.map(np.asarray, call_compiled(put_back, system, part, model, *solved, step, damping, bend))
 
     def put_back_tops(
         self, border: Float[np.ndarray, " border"]
@@ -344,21 +249,7 @@ class Engine:
         images[: len(tile.order)] = solution[tile.order]
         return images
 
-    def _shared_step(self, unknowns: Unknowns, border: Float[np.ndarray, " border"]) -> Step:
-        """Return the border's step of intrinsics and lever arm, within the bounds."""
-        shape, free = self.shape, self.free
-        intrinsics, lever_arm = np.zeros_like(free.intrinsics), np.zeros(3)
-        shared = shape.num_shared_cameras * shape.num_refined
-        if shared:
-            intrinsics[:, np.flatnonzero(shape.refined)] = border[:shared].reshape(-1, shape.num_refined)
-        if shape.lever_arm:
-            lever_arm = border[shared:]
-        if shape.any_bound:
-            moved = np.clip(unknowns.intrinsics + intrinsics, self.lower, self.upper) - unknowns.intrinsics
-            intrinsics = np.where(free.intrinsics > 0, moved, 0.0)
-        return Step(free.poses[:0], intrinsics, lever_arm, free.points)
-
-    def _reduced(
+    def reduced(
         self, step: Step, camera_index: Int[np.ndarray, " images"]
     ) -> tuple[Float[np.ndarray, "images block"], Float[np.ndarray, " border"]]:
         """Return the images' and the border's part of a step, as `_schur.to_reduced` does."""
@@ -399,22 +290,3 @@ class Engine:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
-
-
-def _calls_of_step(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
-    shape, scalar = system.shape, np.zeros(())
-    solution = np.zeros((shape.num_images, shape.block)), np.zeros(shape.border)
-    of_step = system, part, model, *solution, model.gradient, scalar, scalar
-    return [Call(put_back, of_step), Call(costs, (system, part))]
-
-
-@functools.cache
-def _judge_with(solver: SchurLevenbergMarquardt) -> Callable[[State, dict[str, Any]], State]:
-    return lambda state, tried: solver.judge(state, Tried(**tried))
-
-
-_NOTHING_TRIED: dict[str, Any] = {
-    "cost": np.inf, "promised": np.nan, "gradient_norm": np.inf, "shortened": 1.0, "in_sigmas": np.inf,
-    "all_in_sigmas": 0.0, "norm": np.inf, "scaled_norm": 0.0, "linear_iterations": 0, "points_held": 0,
-}  # fmt: skip
-"""Of a step that could not be computed."""

@@ -12,7 +12,6 @@ unknowns, l and the gradient itself.
 
 import functools
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,23 +21,19 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxba._errors import JaxbaError
-from jaxba.ba._adjoint import NOT_A_MINIMUM, ON_BOUND, SINGULAR, hold_saddles, settled, tell_held
+from jaxba.ba._adjoint import ON_BOUND, SINGULAR, hold_saddles, settled, tell_held
 from jaxba.ba._compiler import call_compiled
 from jaxba.ba._hessian import hessian
 from jaxba.ba._linearise import Linearisation, cost, linearise
 from jaxba.ba._problem import Problem
 from jaxba.ba._schur import ReducedVector, back_substitute, eliminate
-from jaxba.ba._solution import Solution
-from jaxba.ba._system import System, is_traced, own_unknowns, restore
-from jaxba.ba._traced import NOT_DOUBLE
+from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
-from jaxba.ba.checks import require_gauge
-from jaxba.ba.tiles._cut import Tile
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Engine
+from jaxba.ba.tiles._gradient_sums import GradientSums
 from jaxba.ba.tiles._programs import Handed, handed
-from jaxba.geometry import AbstractLoss, Linear, Pose
+from jaxba.geometry import AbstractLoss, Linear
 
 
 class _Held(NamedTuple):
@@ -48,80 +43,7 @@ class _Held(NamedTuple):
     free: Step
 
 
-class Cotangents(NamedTuple):
-    """A scalar's gradient by what was found, in the problem's order: unknowns as stored, and the costs.
-
-    - `costs`: in the order of the fields of `Solution`.
-    """
-
-    unknowns: Unknowns
-    costs: tuple[Float[Array | np.ndarray, ""], ...]
-
-
-def solve_reversibly(
-    problem: Problem,
-    loss: AbstractLoss,
-    solve: Callable[[Problem, AbstractLoss], Solution],
-    open_engine: Callable[[Problem, AbstractLoss], AbstractContextManager[Engine]],
-) -> Solution:
-    """Return the solution of a problem under `jax.grad`, which hands the values themselves to the rule below.
-
-    Raises `JaxbaError` inside `jit` and `vmap`, where there are no values, in single precision, and where the values
-    have no derivative.
-    """
-    numbers, rest = eqx.partition((problem, loss), eqx.is_inexact_array)
-
-    @jax.custom_vjp
-    def solved(numbers: Any) -> tuple[Any, ...]:
-        return forward(numbers)[0]
-
-    def forward(numbers: Any) -> tuple[tuple[Any, ...], Any]:
-        if is_traced(numbers):
-            raise JaxbaError(_NO_VALUES)
-        if jnp.result_type(float) != jnp.float64:
-            raise JaxbaError(NOT_DOUBLE)
-        problem, loss = jax.tree.map(np.asarray, eqx.combine(numbers, rest))
-        require_gauge(problem, "Derivatives")
-        solution = solve(problem, loss)
-        if solution.report is not None and solution.report.dropped.any():
-            raise JaxbaError(f"{_LEFT_OUT} {solution.report.dropped.summary()}")
-        if not solution.converged:
-            raise JaxbaError(NOT_A_MINIMUM)
-        unknowns = own_unknowns(solution.apply(problem))
-        costs = solution.initial_cost, solution.final_cost, solution.initial_plain_cost, solution.plain_cost
-        found = unknowns, tuple(map(float, costs)), int(solution.status), int(solution.num_steps)
-        return jax.tree.map(jnp.asarray, found), (problem, loss, unknowns)
-
-    def backward(kept: Any, cotangents: tuple[Any, ...]) -> tuple[Any]:
-        problem, loss, unknowns = kept
-        along: Cotangents = jax.tree.map(np.asarray, Cotangents(*cotangents[:2]))
-        if any(float(along.costs[k]) for k in (0, 2, 3)):
-            raise JaxbaError(_FINAL_COST_ALONE)
-        with open_engine(problem, loss) as engine:
-            try:
-                found = _Reverse(engine, problem, loss, unknowns).gradient(along)
-            except NotPositive as error:
-                raise JaxbaError(NOT_A_MINIMUM) from error
-        asked = jax.tree.map(
-            lambda number, of: None if number is None else jnp.asarray(of), numbers, found, is_leaf=_none
-        )
-        return (asked,)
-
-    solved.defvjp(forward, backward)
-    return Solution.of(problem, *solved(numbers))
-
-
-_NO_VALUES = (
-    "solve_tiled: the problem's values are traced, as inside jit and vmap. jax.grad is taken outside of them, or use "
-    "solve there."
-)
-_LEFT_OUT = (
-    "Derivatives: solve what is left of the problem, solution.report.problem of a solve before; this one leaves out:"
-)
-_FINAL_COST_ALONE = "solve_tiled: of the costs only final_cost has a derivative; use solve for the others."
-
-
-class _Reverse:
+class Reverse:
     """The engine of a problem at its optimum, whose equations it keeps."""
 
     def __init__(self, engine: Engine, problem: Problem, loss: AbstractLoss, found: Unknowns) -> None:
@@ -136,7 +58,7 @@ class _Reverse:
             first[engine.tiles[number][0].images] = number
         self.first_tile = first  # which gives an image's own part of a right-hand side
 
-    def gradient(self, cotangents: Cotangents) -> tuple[Problem, AbstractLoss]:
+    def gradient(self, along_unknowns: Unknowns, along_cost: Float[np.ndarray, ""]) -> tuple[Problem, AbstractLoss]:
         engine = self.engine
         if not isinstance(self.loss, Linear):
             self._move_tiles(lambda number, part: call_compiled(settled, engine.system(number), part))
@@ -144,17 +66,17 @@ class _Reverse:
         before = engine.costs(self.unknowns)[0]
         self._newton(solution, tail, before)
 
-        along = self._to_tangent(cotangents.unknowns)
+        along = self._to_tangent(along_unknowns)
         rhs = functools.partial(self._rhs_of_tile, along)
         solution, tail = self._solved(rhs)
-        total = _zeros_like(self.problem, self.loss)
-        steps = functools.partial(self._pull_tile, solution, tail, rhs, np.asarray(cotangents.costs[1]))
+        total = GradientSums(self.problem, self.loss)
+        steps = functools.partial(self._pull_tile, solution, tail, rhs, along_cost)
         held, points = 0, int(np.count_nonzero(self.problem.free.points))
         for number, (found, count) in enumerate(engine.each_tile(steps)):
             held += count
-            self._add(total, engine.tiles[number][0], found)
+            total.add(engine.tiles[number][0], *found)
         tell_held(jnp.asarray(points), jnp.asarray(points - held))
-        return self._assembled(total, cotangents.unknowns)
+        return total.assembled(along_unknowns, self.at_lower, self.at_upper)
 
     def _at_bounds(self) -> tuple[Bool[np.ndarray, "cameras parameters"], Bool[np.ndarray, "cameras parameters"]]:
         """Return which free intrinsics are pressed against a bound."""
@@ -304,94 +226,6 @@ class _Reverse:
         pulled = call_compiled(_pull, system, tile.take(self.unknowns), step, of_cost)
         count = int(np.sum(system.free.points[:, 0]) - np.sum(held.free.points[:, 0]))
         return jax.tree.map(np.asarray, pulled), count
-
-    def _add(self, total: "_Total", tile: Tile, pulled: tuple[System, Unknowns]) -> None:
-        """Add a tile's gradient by its system and its unknowns to that by the problem."""
-        of_system, of_unknowns = pulled
-        plan, seen = tile.plan, self.problem.observations
-        layout = np.flatnonzero(plan.row_observation >= 0)
-        rows = tile.rows[plan.row_observation[layout]]
-        total.xy_px[rows] += of_system.reprojection.xy_px.reshape(2, -1)[:, layout].T
-        total.std_px[rows] -= of_system.reprojection.weight.reshape(-1)[layout] / np.asarray(seen.std_px)[rows] ** 2
-        for fields, chosen, prior in zip(total.priors, tile.prior_rows, of_system.priors, strict=True):
-            for name, whole in fields.items():
-                whole[chosen] += getattr(prior, name)[: len(chosen)]
-        losses = [of_system.loss, *(prior.loss for prior in of_system.priors)]
-        for whole, loss in zip(total.losses, losses, strict=True):
-            whole += np.array(jax.tree.leaves(loss))
-        found = restore(of_unknowns, plan)
-        total.unknowns.poses.quaternion[tile.images] += found.poses.quaternion
-        total.unknowns.poses.translation[tile.images] += found.poses.translation
-        total.unknowns.intrinsics[tile.cameras] += found.intrinsics
-        total.unknowns.lever_arm[:] += found.lever_arm
-        total.unknowns.points[tile.points] += found.points
-
-    def _assembled(self, total: "_Total", direct: Unknowns) -> tuple[Problem, AbstractLoss]:
-        """Return the gradient as trees like the problem and its loss; what is fixed moves with its start value."""
-        problem, free = self.problem, self.problem.free
-        through = jax.tree.map(lambda a, b: a + np.asarray(b), total.unknowns, direct)
-        fixed_pose, fixed_point = (~np.asarray(of)[:, None] for of in (free.poses, free.points))
-        intrinsics = through.intrinsics
-        of_start = np.where(np.asarray(free.intrinsics), 0.0, intrinsics)
-        priors = tuple(
-            _with_fields(prior, fields, loss)
-            for prior, fields, loss in zip(problem.priors, total.priors, total.losses[1:], strict=True)
-        )
-        changed = eqx.tree_at(
-            lambda p: (p.poses, p.cameras, p.points, p.priors, p.lever_arm, p.lower, p.upper, p.observations.xy_px,
-                       p.observations.std_px),
-            problem,
-            (
-                Pose(through.poses.quaternion * fixed_pose, through.poses.translation * fixed_pose),
-                type(problem.cameras).from_parameters(of_start),
-                through.points * fixed_point,
-                priors,
-                through.lever_arm * (not np.asarray(free.lever_arm)),
-                np.where(self.at_lower, intrinsics, 0.0),
-                np.where(self.at_upper, intrinsics, 0.0),
-                total.xy_px,
-                total.std_px,
-            ),
-        )  # fmt: skip
-        return changed, _with_leaves(self.loss, total.losses[0])
-
-
-class _Total(NamedTuple):
-    """The gradient while tiles add to it."""
-
-    xy_px: np.ndarray
-    std_px: np.ndarray
-    priors: list[dict[str, np.ndarray]]
-    losses: list[np.ndarray]
-    unknowns: Unknowns
-
-
-def _zeros_like(problem: Problem, loss: AbstractLoss) -> _Total:
-    observations = problem.observations
-    priors = [
-        {n: np.zeros(np.shape(v)) for n, v in vars(prior).items() if n != "loss" and np.asarray(v).dtype.kind == "f"}
-        for prior in problem.priors
-    ]
-    losses = [np.zeros(len(jax.tree.leaves(of))) for of in (loss, *(prior.loss for prior in problem.priors))]
-    zero = jax.tree.map(np.zeros_like, own_unknowns(problem))
-    return _Total(np.zeros(observations.xy_px.shape), np.zeros(observations.std_px.shape), priors, losses, zero)
-
-
-def _with_fields(prior: Any, fields: dict[str, np.ndarray], loss: np.ndarray) -> Any:
-    names = list(fields)
-    changed = eqx.tree_at(lambda p: [getattr(p, name) for name in names], prior, [fields[name] for name in names])
-    return eqx.tree_at(lambda p: p.loss, changed, _with_leaves(prior.loss, loss))
-
-
-def _none(leaf: Any) -> bool:
-    return leaf is None
-
-
-def _with_leaves(loss: AbstractLoss, values: np.ndarray) -> AbstractLoss:
-    leaves, structure = jax.tree.flatten(loss)
-    return jax.tree.unflatten(
-        structure, [np.reshape(value, np.shape(leaf)) for value, leaf in zip(values, leaves, strict=True)]
-    )
 
 
 def _exact(system: System, unknowns: Unknowns, free_intrinsics: Array) -> _Held:

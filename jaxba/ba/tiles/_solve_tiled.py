@@ -16,7 +16,8 @@ from jaxba.ba._system import centred, from_centred, is_traced, own_unknowns
 from jaxba.ba.checks import prepare
 from jaxba.ba.tiles._checkpoint import Checkpoint, Standing
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
-from jaxba.ba.tiles._reverse import solve_reversibly
+from jaxba.ba.tiles._reversible import solve_reversibly
+from jaxba.ba.tiles._step import Stepper
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
 
@@ -103,7 +104,8 @@ def in_tiles(
     with opened(label, near, loss, **room) as engine:
         start = own_unknowns(near)
         set_up = time.perf_counter()
-        engine.compile(start)
+        stepper = Stepper(engine, solver)
+        stepper.compile(start)
         compiled = time.perf_counter()
         costs = engine.costs(start)
         if standing is None:
@@ -111,7 +113,7 @@ def in_tiles(
         found, state, history, interrupted = walk(
             standing.unknowns,
             standing.state,
-            lambda unknowns, state: engine.step(solver, unknowns, state),
+            stepper.step,
             max_nfev,
             callback,
             before=standing.history,

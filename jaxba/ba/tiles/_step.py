@@ -1,0 +1,161 @@
+"""A step of the solver over the tree: the same as that of the block in one piece.
+
+The root solves for the border, within its bounds; each tile solves for its points and refines them, and gives its part
+of the sums that the step is judged by, as the solver judges in one piece.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.ba._compiler import call_compiled
+from jaxba.ba._factor import box_minimum
+from jaxba.ba._linearise import Linearisation, costs
+from jaxba.ba._solvers import SchurLevenbergMarquardt, State, Tried, projected_gradient_norm
+from jaxba.ba._system import System
+from jaxba.ba._unknowns import Step, Unknowns
+from jaxba.ba.tiles._dense import NotPositive
+from jaxba.ba.tiles._engine import Call, Engine
+from jaxba.ba.tiles._programs import Sums, put_back
+from jaxba.geometry import Pose
+
+
+class Stepper:
+    """Takes steps of a solver with an engine."""
+
+    def __init__(self, engine: Engine, solver: SchurLevenbergMarquardt) -> None:
+        self.engine, self.solver = engine, solver
+
+    def compile(self, unknowns: Unknowns) -> None:
+        """Compile what a step calls, side by side; without it that happens at the first one."""
+        self.engine.compile(unknowns, _calls_of_step)
+
+    def step(self, unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
+        """Return the unknowns and the state after a step was tried."""
+        damping, bend = np.asarray(state.trust), np.asarray(state.bend)
+        try:
+            up = self.engine.up(self.engine.step_equations(unknowns, damping, bend), damping)
+        except NotPositive:
+            return unknowns, call_compiled(_judge_with(self.solver), state, jax.tree.map(np.asarray, _NOTHING_TRIED))
+        trial, sums, squared_norm = self._down(unknowns, self._border(unknowns, up.update), damping, bend)
+        gradient = up.gradient
+        of_all = Step(gradient.poses, gradient.intrinsics, gradient.lever_arm, np.array([[up.steepest, 0.0, 0.0]]))
+        tried = _NOTHING_TRIED | {
+            "cost": sums.cost,
+            "promised": -sums.slope - sums.curvature / 2,
+            "gradient_norm": call_compiled(
+                projected_gradient_norm, self.engine.lower, self.engine.upper, unknowns.intrinsics, of_all
+            ),
+            "shortened": 1 + damping,
+            "in_sigmas": np.sqrt(sums.in_sigmas),
+            "all_in_sigmas": np.sqrt(sums.all_in_sigmas),
+            "norm": np.sqrt(squared_norm),
+            "points_held": int(sums.points_held),
+        }
+        judged = call_compiled(_judge_with(self.solver), state, jax.tree.map(np.asarray, tried))
+        return (trial if judged.accepted else unknowns), judged
+
+    def _border(self, unknowns: Unknowns, top: Float[np.ndarray, "tail tail"]) -> Float[np.ndarray, " border"]:
+        """Return the border's solution from what the root hands on."""
+        engine, count = self.engine, self.engine.shape.border
+        if not count:
+            return np.zeros(0)
+        corner = np.tril(top[:count, :count])
+        corner = corner + np.tril(corner, -1).T
+        lower = upper = None
+        if engine.shape.any_bound:
+            lower, upper = (
+                engine.reduced(
+                    Step(engine.free.poses, bound - unknowns.intrinsics, far, engine.free.points), engine.camera_index
+                )[1]
+                for bound, far in ((engine.lower, np.full(3, -np.inf)), (engine.upper, np.full(3, np.inf)))
+            )
+        return np.asarray(call_compiled(box_minimum, corner, top[count, :count], lower, upper))
+
+    def _down(
+        self,
+        unknowns: Unknowns,
+        border: Float[np.ndarray, " border"],
+        damping: Float[np.ndarray, ""],
+        bend: Float[np.ndarray, ""],
+    ) -> tuple[Unknowns, Sums, float]:
+        """Return the unknowns after the step, what it is judged by, and its squared length."""
+        solution, tail = self.engine.put_back_tops(border)
+        shared = self._shared_step(unknowns, border)
+        work = functools.partial(self._down_tile, unknowns, solution, tail, shared, damping, bend)
+        trial = Unknowns(
+            Pose(unknowns.poses.quaternion.copy(), unknowns.poses.translation.copy()),
+            unknowns.intrinsics + shared.intrinsics,
+            unknowns.lever_arm + shared.lever_arm,
+            unknowns.points.copy(),
+        )
+        totals = Sums(*[np.zeros(()) for _ in Sums._fields])
+        for (tile, _), (part, sums) in zip(self.engine.tiles, self.engine.each_tile(work), strict=True):
+            tile.put(part, trial)
+            totals = Sums(*[total + own for total, own in zip(totals, sums, strict=True)])
+        if self.engine.shape.own_cameras:
+            refined = np.flatnonzero(self.engine.shape.refined)
+            trial.intrinsics[self.engine.camera_index[:, None], refined] += solution[:, 6:]
+        squared = np.sum(solution**2) + np.sum(shared.intrinsics**2) + np.sum(shared.lever_arm**2) + totals.of_points
+        return trial, totals, float(squared)
+
+    def _down_tile(
+        self,
+        unknowns: Unknowns,
+        solution: Float[np.ndarray, "images block"],
+        tail: Float[np.ndarray, " tail"],
+        shared: Step,
+        damping: Float[np.ndarray, ""],
+        bend: Float[np.ndarray, ""],
+        number: int,
+    ) -> tuple[Unknowns, Sums]:
+        tile, _ = self.engine.tiles[number]
+        images = self.engine.put_back_tile(number, solution, tail)
+        system, part = self.engine.system(number), tile.take(unknowns)
+        model = self.engine.equations(number, part, bend)
+        intrinsics = shared.intrinsics
+        if self.engine.shape.own_cameras:
+            intrinsics = np.zeros(part.intrinsics.shape)
+            intrinsics[:, np.flatnonzero(self.engine.shape.refined)] = images[:, 6:]
+        step = Step(images[:, :6], intrinsics, shared.lever_arm, np.zeros_like(part.points))
+        solved = images, tail[: self.engine.shape.border]
+        return jax.tree.map(np.asarray, call_compiled(put_back, system, part, model, *solved, step, damping, bend))
+
+    def _shared_step(self, unknowns: Unknowns, border: Float[np.ndarray, " border"]) -> Step:
+        """Return the border's step of intrinsics and lever arm, within the bounds."""
+        shape, free = self.engine.shape, self.engine.free
+        intrinsics, lever_arm = np.zeros_like(free.intrinsics), np.zeros(3)
+        shared = shape.num_shared_cameras * shape.num_refined
+        if shared:
+            intrinsics[:, np.flatnonzero(shape.refined)] = border[:shared].reshape(-1, shape.num_refined)
+        if shape.lever_arm:
+            lever_arm = border[shared:]
+        if shape.any_bound:
+            moved = (
+                np.clip(unknowns.intrinsics + intrinsics, self.engine.lower, self.engine.upper) - unknowns.intrinsics
+            )
+            intrinsics = np.where(free.intrinsics > 0, moved, 0.0)
+        return Step(free.poses[:0], intrinsics, lever_arm, free.points)
+
+
+def _calls_of_step(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
+    shape, scalar = system.shape, np.zeros(())
+    solution = np.zeros((shape.num_images, shape.block)), np.zeros(shape.border)
+    of_step = system, part, model, *solution, model.gradient, scalar, scalar
+    return [Call(put_back, of_step), Call(costs, (system, part))]
+
+
+@functools.cache
+def _judge_with(solver: SchurLevenbergMarquardt) -> Callable[[State, dict[str, Any]], State]:
+    return lambda state, tried: solver.judge(state, Tried(**tried))
+
+
+_NOTHING_TRIED: dict[str, Any] = {
+    "cost": np.inf, "promised": np.nan, "gradient_norm": np.inf, "shortened": 1.0, "in_sigmas": np.inf,
+    "all_in_sigmas": 0.0, "norm": np.inf, "scaled_norm": 0.0, "linear_iterations": 0, "points_held": 0,
+}  # fmt: skip
+"""Of a step that could not be computed."""

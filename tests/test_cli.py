@@ -152,6 +152,28 @@ def test_interrupt_writes_what_was_reached_and_exits_with_130(
     assert np.any(jaxba.read_tile(tile.with_name("tile.solved.npz")).points != survey.problem.points)
 
 
+def test_an_interrupted_solve_in_tiles_goes_on(cli: Cli, tile: Path, monkeypatch: pytest.MonkeyPatch):
+    # breaks where the second call begins anew, or leaves the checkpoint behind
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    whole = json.loads(cli("solve", tile, "--tiled", "--json")[1])
+    adjusted = tile.with_name("tile.solved.npz").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(_progress, "print_step", interrupt)
+        code, out, err = cli("solve", tile, "--tiled", "--json", "--verbose")
+    assert (code, json.loads(out)["num_steps"]) == (130, 1) and "the same command goes on from there" in err
+    checkpoint = tile.with_name("tile.solved.npz.checkpoint")
+    assert checkpoint.is_file()
+    code, _, err = cli("solve", tile, "--tiled", "--loss", "cauchy")
+    assert code == 2 and f"{checkpoint}: is the checkpoint of another problem or loss; remove it" in err
+    code, out, err = cli("solve", tile, "--tiled", "--json")
+    assert code == 0 and f"going on from {checkpoint}" in err
+    assert json.loads(out)["num_steps"] == whole["num_steps"]
+    assert tile.with_name("tile.solved.npz").read_bytes() == adjusted
+    assert not checkpoint.exists()
+
+
 def test_interrupt_before_the_first_step_writes_nothing(cli: Cli, tile: Path, monkeypatch: pytest.MonkeyPatch):
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt

@@ -48,7 +48,11 @@ class SolveOptions:
     ] = "auto"
     tiled: Annotated[
         bool,
-        Parameter(negative="", show_default=False, help="Tile by tile: the same solution, for blocks of any size."),
+        Parameter(
+            negative="",
+            show_default=False,
+            help="Tile by tile: the same solution, for blocks of any size. After Ctrl-C the same command goes on.",
+        ),
     ] = False
     max_memory: Annotated[
         str | None,

@@ -49,7 +49,10 @@ def run(file: Path, options: SolveOptions) -> int:
     _check_output(out, given)
     use_compilation_cache()
     begin = time.perf_counter()
-    found = _adjust(problem, loss, options)
+    standing = _checkpoint(out, options)
+    if standing is not None and standing.exists():
+        print(f"jaxba: going on from {standing}, where a solve before this one stopped.", file=sys.stderr)
+    found = _adjust(problem, loss, options, standing)
     seconds = time.perf_counter() - begin
     _write(out, given, problem, found, extras)
     done = Run(file, out, given, problem, found, loss, options, seconds)
@@ -58,7 +61,8 @@ def run(file: Path, options: SolveOptions) -> int:
     elif not options.quiet:
         print(summary(done))
     if found.solution.result == "interrupted":
-        print(f"jaxba: interrupted; {out} holds the values reached so far.", file=sys.stderr)
+        again = "" if standing is None else "; the same command goes on from there"
+        print(f"jaxba: interrupted; {out} holds the values reached so far{again}.", file=sys.stderr)
         return INTERRUPTED
     return 0 if found.solution.converged else NOT_CONVERGED
 
@@ -181,7 +185,12 @@ def _check_output(out: Path, given: Problem) -> None:
             raise JaxbaError(f"{out}: BAL cannot hold {'; '.join(lost)}. Name a tile (--out NAME.npz) instead.")
 
 
-def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Rejected:
+def _checkpoint(out: Path, options: SolveOptions) -> Path | None:
+    """Return the file in which a solve in tiles keeps where it stands; rounds of rejection are many solves, without."""
+    return out.with_name(f"{out.name}.checkpoint") if options.tiled and not rounds_of(options) else None
+
+
+def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions, checkpoint: Path | None) -> Rejected:
     """Solve, with rounds of rejection if asked for; a plain solve comes back as a result of no rounds."""
     with contextlib.ExitStack() as stack:
         callback: Callable[[HistoryStep], None] | None = None
@@ -198,7 +207,7 @@ def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Reje
             "callback": callback,
         }
         if options.tiled:
-            settings |= {"solver": solve_tiled, "max_memory": options.max_memory}
+            settings |= {"solver": solve_tiled, "max_memory": options.max_memory, "checkpoint": checkpoint}
         else:
             settings |= {"method": options.method, "linear_solver": options.linear_solver}
         return solve_and_reject(problem, rounds=rounds_of(options), mad_factor=options.mad_factor, **settings)

@@ -7,6 +7,9 @@ seconds a step (medians over all steps but the first), the peak of memory, and h
 `--sizes`: images of the blocks. `--limited`: which of them are solved under `--max-memory` as well. `--whole`: which of
 them are solved in one piece as well. `--shapes`: in place of all that, blocks of other shapes beside square ones.
 
+`--covariance`: in place of all that, `jaxba.covariance` of blocks of these sizes, in all memory and under `--max-memory`.
+Prints the seconds of a first call, which compiles, and the peak of memory.
+
 `--merge`: in place of all that, what it costs to adjust tiles each on its own and merge them. The same block of 400
 images, with GNSS, and with control points as well, is adjusted exactly, and in 4 and 9 tiles that are merged, with and
 without the global pass. Prints the cost over the exact one, rms distances of camera centres and points from the exact
@@ -56,6 +59,7 @@ def main() -> None:
     parser.add_argument("--max-memory", default="4GB")
     parser.add_argument("--shapes", action="store_true")
     parser.add_argument("--merge", action="store_true")
+    parser.add_argument("--covariance", type=int, nargs="*")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -63,6 +67,9 @@ def main() -> None:
         return
     if options.shapes:
         _shapes()
+        return
+    if options.covariance is not None:
+        _covariance(options.covariance or [1000, 4000, 16000], options.max_memory)
         return
     if options.merge:
         _merge()
@@ -112,6 +119,23 @@ def _shapes() -> None:
         )
 
 
+def _covariance(sizes: list[int], max_memory: str) -> None:
+    """Print the table of covariances."""
+    print("| images | observations | memory allowed | seconds | peak of memory (GB) |\n| --- | --- | --- | --- | --- |")
+    with tempfile.TemporaryDirectory() as folder:
+        for size in sizes:
+            file = Path(folder) / f"{size}.npz"
+            _run("make", file, {"num_images": size})
+            for limit in (None, max_memory):
+                found = _run("covariance", file, {"max_memory": limit})
+                print(
+                    f"| {size} | {found['observations']:,} | {limit or 'all'} | {found['seconds']:.1f} | "
+                    f"{found['peak'] / 1e9:.2f} |",
+                    flush=True,
+                )
+            file.unlink()
+
+
 def _run(way: str, file: Path, options: dict[str, Any] | None = None) -> dict[str, float]:
     command = [sys.executable, "-m", "benchmarks.tiles", "--one", way, str(file), json.dumps(options)]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
@@ -124,6 +148,12 @@ def _one(way: str, file: str, options: str) -> None:
         print("{}")
         return
     problem = jaxba.read_tile(file)
+    if way == "covariance":
+        begun = time.perf_counter()
+        jaxba.covariance(problem, **json.loads(options))
+        seconds = time.perf_counter() - begun
+        print(json.dumps({"observations": problem.num_observations, "seconds": seconds, "peak": _peak()}))
+        return
     views = np.bincount(problem.observations.point_index)
     loaded = _peak()
     begun = time.perf_counter()

@@ -7,7 +7,8 @@ seconds a step (medians over all steps but the first), the peak of memory, and h
 `--sizes`: images of the blocks. `--limited`: which of them are solved under `--max-memory` as well. `--whole`: which of
 them are solved in one piece as well. `--shapes`: in place of all that, blocks of other shapes beside square ones.
 
-`--covariance`: in place of all that, `jaxba.covariance` of blocks of these sizes, in all memory and under `--max-memory`.
+`--covariance`: in place of all that, `jaxba.covariance` of blocks of these sizes, in all memory and under
+`--max-memory`.
 Prints the seconds of a first call, which compiles, and the peak of memory.
 
 `--merge`: in place of all that, what it costs to adjust tiles each on its own and merge them. The same block of 400

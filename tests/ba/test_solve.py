@@ -79,8 +79,8 @@ def test_vmap_over_pixels_equals_one_solve_each() -> None:
 def test_the_origin_of_the_world_does_not_change_the_answer(offset: tuple[float, float, float]) -> None:
     here = jaxba.solve(PROBLEM, loss=LOSS)
     there = jaxba.solve(moved(PROBLEM, np.array(offset)), loss=LOSS)
-    # of each coordinate given, times what the geometry makes of it, beside what rounding in the equations leaves in weak
-    # directions: up to 1.7e-9 m over four offsets within 10 km and three tolerances of the solve
+    # of each coordinate given, times what the geometry makes of it, beside what rounding in the equations leaves in
+    # weak directions: up to 1.7e-9 m over four offsets within 10 km and three tolerances of the solve
     rounding = 64 * np.spacing(np.abs(offset).max()) + 3e-9
     assert there.result == here.result
     assert there.num_steps == here.num_steps

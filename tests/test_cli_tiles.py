@@ -16,8 +16,9 @@ from PIL import Image
 
 import jaxba
 from jaxba import Problem, Solution
+from jaxba._atomic import cannot_write
 from jaxba.cli import _solve_batch, main
-from jaxba.io import cannot_write, read_tiles, write_tiles
+from jaxba.io import read_tiles, write_tiles
 
 Answer = tuple[int, str, str]
 Cli = Callable[..., Answer]

@@ -5,13 +5,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxba._atomic import write_atomically
 from jaxba._errors import JaxbaError
 from jaxba.ba import Partition, partition
 from jaxba.cli._settings import configured
 from jaxba.cli._solve import default_output, tile_of
 from jaxba.cli._text import first_of, many, table, to_json
 from jaxba.engine._project import EXPORT, is_project
-from jaxba.io import read_problem, solved_before, write_atomically, write_tiles
+from jaxba.io import read_problem, solved_before, write_tiles
 from jaxba.pipeline import PIPELINE, Tiles
 from jaxba.report import draw_tiles, project_settings
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxba._atomic import refuse_same_file, refuse_unwritable
 from jaxba._errors import JaxbaError
 from jaxba.ba import HistoryStep, Problem, Rejected, solve_and_reject, solve_tiled
 from jaxba.cli import _progress
@@ -24,8 +25,6 @@ from jaxba.io import (
     place_of,
     problem_of_bytes,
     read_bytes,
-    refuse_same_file,
-    refuse_unwritable,
     what_bal_cannot_hold,
     write_bal,
     write_tile,

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from jaxba import __version__
+from jaxba._atomic import cannot_write, refuse_same_file, refuse_unwritable
 from jaxba._errors import JaxbaError
 from jaxba.ba import Problem, Rejected, Solution, prepare, rejecting, solve_batch
 from jaxba.cli._options import BAD_INPUT, INTERRUPTED, NOT_CONVERGED, SolveOptions
@@ -37,12 +38,9 @@ from jaxba.cli._text import many, to_json
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.geometry import AbstractLoss
 from jaxba.io import (
-    cannot_write,
     place_of,
     problem_of_bytes,
     read_bytes,
-    refuse_same_file,
-    refuse_unwritable,
     write_tile,
 )
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from jaxba._atomic import cannot_write
 from jaxba._errors import JaxbaError
-from jaxba.io import cannot_write
 
 _NAME, _HOLDER = ".lock", ".lock.holder"
 _PATIENCE_S, _PAUSE_S = 0.1, 0.02  # `holder` may hold the lock for an instant

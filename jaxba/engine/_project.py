@@ -20,9 +20,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jaxba._atomic import cannot_write, remove_leftovers, write_atomically
 from jaxba._errors import JaxbaError
 from jaxba.engine._store import sha256
-from jaxba.io import cannot_write, remove_leftovers, text_of, write_atomically
+from jaxba.io import text_of
 from jaxba.scene import PhotoFile
 
 SETTINGS, SUMMARY, EXPORT = "jaxba.toml", "summary.json", "export"

@@ -19,10 +19,10 @@ import cattrs
 import numpy as np
 from jaxtyping import AbstractArray
 
+from jaxba._atomic import write_folder_atomically
 from jaxba._errors import JaxbaError
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.engine._key import Key
-from jaxba.io import write_folder_atomically
 
 T = TypeVar("T")
 _RECORD = "record.json"

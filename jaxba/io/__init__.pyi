@@ -1,11 +1,3 @@
-from ._atomic import (
-    cannot_write as cannot_write,
-    refuse_same_file as refuse_same_file,
-    refuse_unwritable as refuse_unwritable,
-    remove_leftovers as remove_leftovers,
-    write_atomically as write_atomically,
-    write_folder_atomically as write_folder_atomically,
-)
 from ._bal import (
     read_bal as read_bal,
     what_bal_cannot_hold as what_bal_cannot_hold,

@@ -20,10 +20,10 @@ import os
 
 import numpy as np
 
+from jaxba._atomic import write_atomically
 from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem
 from jaxba.geometry import BAL, Pose
-from jaxba.io._atomic import write_atomically
 from jaxba.io._read import read_bytes, text_of
 
 _BZ2_MAGIC = b"BZh"

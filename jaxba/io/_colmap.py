@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxba._atomic import cannot_write, write_atomically
 from jaxba._errors import JaxbaError
-from jaxba.io._atomic import cannot_write, write_atomically
 from jaxba.scene import Block
 
 _MODEL_IDS = {

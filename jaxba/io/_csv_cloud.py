@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io._atomic import write_atomically
+from jaxba._atomic import write_atomically
 from jaxba.io._cloud import Cloud
 from jaxba.io._crs import CrsText
 

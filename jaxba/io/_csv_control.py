@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.io._atomic import write_atomically
+from jaxba._atomic import write_atomically
 
 CONTROL_COLUMNS = {
     "name": "name of the point in the list",

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxba._atomic import write_atomically
 from jaxba._errors import JaxbaError
-from jaxba.io._atomic import write_atomically
 from jaxba.io._crs import CrsText
 from jaxba.io._sites import SITE_COLUMNS, Sites
 

@@ -13,8 +13,8 @@ import os
 
 import numpy as np
 
+from jaxba._atomic import write_atomically
 from jaxba._errors import JaxbaError
-from jaxba.io._atomic import write_atomically
 from jaxba.io._cloud import Cloud
 from jaxba.io._crs import CrsText
 

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxba._atomic import write_atomically
 from jaxba._errors import JaxbaError
-from jaxba.io._atomic import write_atomically
 from jaxba.scene import Block, LocalFrame, Photo
 
 _BROWN = ("k1", "k2", "p1", "p2", "k3")

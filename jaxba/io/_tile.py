@@ -10,10 +10,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from jaxba._atomic import write_atomically
 from jaxba._errors import JaxbaError
 from jaxba.ba import PRIORS, AbstractPrior, Free, Observations, Problem
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Pose, check_loss
-from jaxba.io._atomic import write_atomically
 from jaxba.io._check import check_arrays, check_names
 from jaxba.io._npz import read_npz, write_npz
 from jaxba.io._read import read_bytes

@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
+from jaxba._atomic import cannot_write, refuse_same_file
 from jaxba._errors import JaxbaError
 from jaxba.ba import BlockTile, Partition, Problem
-from jaxba.io._atomic import cannot_write, refuse_same_file
 from jaxba.io._read import read_bytes
 from jaxba.io._schema import EXTRA
 from jaxba.io._tile import arrays_of, tile_of_bytes, write_tile

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from jaxba._atomic import write_folder_atomically
 from jaxba._errors import JaxbaError
 from jaxba.engine import _store
 from jaxba.engine._limits import check_failures
@@ -25,7 +26,6 @@ from jaxba.engine._settings import Settings, to_toml
 from jaxba.engine._stage import Stage, left_out
 from jaxba.engine._work import Work, collected, failures, run_one, why_to_do, without_path, works
 from jaxba.engine._workers import Resources, memory_for
-from jaxba.io import write_folder_atomically
 from jaxba.pipeline._done import Done
 from jaxba.pipeline._events import Event, Run
 from jaxba.pipeline._stages import NAMES, STAGES

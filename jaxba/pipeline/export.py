@@ -314,7 +314,7 @@ def _name_notes(photos: list[Photo]) -> list[str]:
 
 
 def _write(path: Path, content: bytes) -> None:
-    from jaxba.io import write_atomically
+    from jaxba._atomic import write_atomically
 
     with write_atomically(path) as file:
         file.write(content)

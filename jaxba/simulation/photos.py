@@ -29,11 +29,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxba._atomic import cannot_write, write_atomically
 from jaxba._errors import JaxbaError
 from jaxba.engine import Parameters, parameter
 from jaxba.geo import geodetic_from_local, projected_from_local
 from jaxba.geometry import OpenCV
-from jaxba.io import cannot_write, write_atomically
 from jaxba.scene import Attitude
 from jaxba.simulation import PhotoTags, expose, ground_points, jpeg_with_tags, paint_ground, pixel_rays, render
 from jaxba.simulation._flight import Terrain, smooth_terrain

@@ -316,6 +316,22 @@ def test_a_second_call_goes_on_from_the_checkpoint_to_the_same_bytes(tmp_path: P
     assert not path.exists()
 
 
+def test_a_checkpoint_that_cannot_be_written_is_refused_or_told(tmp_path: Path) -> None:
+    with pytest.raises(JaxbaError, match=r"nowhere/standing: not written, .*create the folder first"):
+        jaxba.solve_tiled(_everything(), checkpoint=tmp_path / "nowhere" / "standing")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+
+    def gone(step: jaxba.ba.HistoryStep) -> None:
+        if step.step == 1:
+            (folder / "standing").unlink()
+            folder.rmdir()
+
+    options = {"loss": Huber(1.0), "num_tiles": 4, "max_nfev": 2}
+    with pytest.warns(RuntimeWarning, match=r"standing: not written, .*The solve goes on without a checkpoint"):
+        assert jaxba.solve_tiled(_everything(), **options, checkpoint=folder / "standing", callback=gone).num_steps == 2
+
+
 @pytest.mark.parametrize("content", [b"", b"PK no archive", b"text"])
 def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "standing"

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxba._atomic import refuse_unwritable, write_atomically
 from jaxba._errors import JaxbaError
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep
@@ -42,8 +43,10 @@ class Checkpoint:
     def load(self) -> Standing | None:
         """Return where the solve stood, or None where there is no file yet.
 
-        Raises `JaxbaError` for a file that cannot be read, and for that of another problem or loss.
+        Raises `JaxbaError` for a file that cannot be read, or could not be written, and for that of another problem or
+        loss.
         """
+        refuse_unwritable(self._path)
         if not self._path.exists():
             return None
         cure = "remove it to begin anew, or name another file"
@@ -67,17 +70,11 @@ class Checkpoint:
         arrays |= {f"unknown_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(unknowns))}
         arrays |= {f"state_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
         arrays["history"] = np.array([[getattr(step, name) for name in _STEP_FIELDS] for step in history], float)
-        part = self._path.with_name(self._path.name + ".part")
         try:
-            with part.open("wb") as file:
+            with write_atomically(self._path) as file:
                 np.savez(file, **arrays)
-            os.replace(part, self._path)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            text = (
-                f"{self._path}: the checkpoint could not be written ({error.strerror}); the solve goes on without it."
-            )
-            warnings.warn(text, RuntimeWarning, stacklevel=2)
+        except JaxbaError as error:
+            warnings.warn(f"{error} The solve goes on without a checkpoint of this step.", RuntimeWarning, stacklevel=2)
 
     def remove(self) -> None:
         """Remove the file of a solve that has ended."""

@@ -10,7 +10,7 @@ its leaf to the root, and eliminating images from the leaves up couples nothing 
 A point stands where the cameras that see it are on the average: one with a wild start value, or far away, falls on the
 same side as its neighbours. Of four directions and eleven places near the middle, that plane is taken which the fewest
 images see across. The cut then leaves the plane where still fewer images see across so (Liu 1989, "A graph partitioning
-algorithm by node separators"): fronts take 35% less arithmetic at 1000 images and 41% less at 4000. Cuts go on while
+algorithm by node separators"): fronts take 40% less arithmetic at 1000 images and at 4000. Cuts go on while
 they save arithmetic.
 
 Cost: O(observations) a level and direction; 0.8 s for 4000 images with 990k observations, and 0.8 s to leave planes.

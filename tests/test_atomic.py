@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from jaxba._atomic import refuse_same_file, remove_leftovers, write_atomically, write_folder_atomically
 from jaxba._errors import JaxbaError
-from jaxba.io import refuse_same_file, remove_leftovers, write_atomically, write_folder_atomically
 
 
 def test_file_appears_at_the_end_and_nothing_else_stays(tmp_path: Path):

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._plan_shape import PlanShape, alike, bare_shape, larger, num_rows
@@ -99,6 +99,19 @@ def _tile_of_rows(prior: AbstractPrior, owners: dict[str, Int[np.ndarray, " _"]]
         if hasattr(prior, name):
             return tiles[np.asarray(getattr(prior, name))]
     return np.zeros(num_rows(prior), np.int32)
+
+
+def rows_about(
+    prior: AbstractPrior, chosen: dict[str, Bool[np.ndarray, " _"]], *, shared: bool
+) -> Int[np.ndarray, " rows"]:
+    """Return the rows of a prior that concern what is chosen.
+
+    - `chosen`: masks of images, points and cameras, by the name of their index. `shared`: whether the rows of a prior
+      without an index, which is about what all share, are among them.
+    """
+    masks = [mask[np.asarray(getattr(prior, name))] for name, mask in chosen.items() if hasattr(prior, name)]
+    found = np.logical_and.reduce(masks) if masks else np.full(num_rows(prior), shared)
+    return np.flatnonzero(found)
 
 
 def sub_problem(

@@ -26,13 +26,13 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.ba._compiler import fast_jit
-from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba._problem import Problem
 from jaxba.ba._projection import camera_centers, rotation_matrices
 from jaxba.ba._selection import Selection
 from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._system import own_unknowns
-from jaxba.ba.tiles._cut import sub_problem
+from jaxba.ba.tiles._cut import rows_about, sub_problem
 from jaxba.ba.tiles._partition import BlockTile
 from jaxba.geometry import AbstractCamera, AbstractLoss
 
@@ -80,7 +80,7 @@ def adjust_shared(
     free_cameras = ~np.isin(np.arange(problem.num_cameras), camera_index[~free_images])
     free = {"image_index": free_images, "point_index": free_points, "camera_index": free_cameras}
     cameras = np.unique(camera_index[images])
-    of_priors = [_rows_of_free(prior, free) for prior in problem.priors]
+    of_priors = [rows_about(prior, free, shared=False) for prior in problem.priors]  # the lever arm is held
     part = sub_problem(problem, rows, images, points, cameras, of_priors)
     part = part.fix(poses=~free_images[images], points=~free_points[points])
     part = _held(part, np.broadcast_to(~free_cameras[cameras][:, None], part.lower.shape))
@@ -98,14 +98,6 @@ def adjust_shared(
 def _held(problem: Problem, intrinsics: Selection) -> Problem:
     """Return the problem with these intrinsics and the lever arm held."""
     return eqx.tree_at(lambda p: p.free.lever_arm, problem.fix(intrinsics=intrinsics), np.array(False))
-
-
-def _rows_of_free(prior: AbstractPrior, free: dict[str, Bool[np.ndarray, " _"]]) -> Int[np.ndarray, " rows"]:
-    """Return the rows of a prior that touch what is free; none of the lever arm's, which is held."""
-    for name, mask in free.items():
-        if hasattr(prior, name):
-            return np.flatnonzero(mask[np.asarray(getattr(prior, name))])
-    return np.zeros(0, int)
 
 
 def intersect(problem: Problem, points: Int[np.ndarray, " points"]) -> tuple[Problem, Bool[np.ndarray, " points"]]:

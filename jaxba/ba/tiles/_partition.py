@@ -14,12 +14,11 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._plan_shape import num_rows
-from jaxba.ba._problem import AbstractPrior, Observations, Problem
+from jaxba.ba._problem import Observations, Problem
 from jaxba.ba._projection import camera_centers
 from jaxba.ba._system import is_traced
 from jaxba.ba.checks import validate
-from jaxba.ba.tiles._cut import sub_problem
+from jaxba.ba.tiles._cut import rows_about, sub_problem
 from jaxba.ba.tiles._dissect import dissect_images
 from jaxba.ba.tiles._flight_lines import along_lines
 from jaxba.geometry import require_number
@@ -239,16 +238,7 @@ def _tile(problem: Problem, is_of_tile: Bool[np.ndarray, " images"], is_own: Boo
     has_camera = np.zeros(problem.num_cameras, bool)
     has_camera[cameras] = True
     kept = {"image_index": is_of_tile, "point_index": has_point, "camera_index": has_camera}
-    of_priors = [_rows_of(prior, kept) for prior in problem.priors]
+    of_priors = [rows_about(prior, kept, shared=True) for prior in problem.priors]
     found = sub_problem(problem, rows, images, points, cameras, of_priors)
     names = tuple(problem.image_names[number] for number in images) if problem.image_names else ()
     return BlockTile(dataclasses.replace(found, image_names=names), images, points, is_own[images])
-
-
-def _rows_of(prior: AbstractPrior, kept: dict[str, Bool[np.ndarray, " _"]]) -> Int[np.ndarray, " rows"]:
-    """Return the rows of a prior that concern what is kept, told by the name of its index; all of one without any."""
-    chosen = np.ones(num_rows(prior), bool)
-    for name, is_kept in kept.items():
-        if hasattr(prior, name):
-            chosen &= is_kept[np.asarray(getattr(prior, name))]
-    return np.flatnonzero(chosen)

@@ -53,7 +53,7 @@ def solve_tiled(
     Raises `JaxbaError` as `solve` does, and where memory or disk do not suffice.
 
     `jax.grad` goes through it, tile by tile: the derivative is that of `solve`, in reverse mode alone, and not inside
-    `jit` or `vmap`.
+    `jit` or `vmap`. `max_memory` is planned for steps; the gradient of a tile takes more than its step.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(30)

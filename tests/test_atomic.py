@@ -137,7 +137,7 @@ def test_folder_that_cannot_take_its_place_leaves_the_old_one(tmp_path: Path, mo
 
 def test_what_a_killed_process_leaves_is_removed(tmp_path: Path):
     code = (
-        "import os, sys\nfrom jaxba.io import write_atomically, write_folder_atomically\nplace = sys.argv[1]\n"
+        "import os, sys\nfrom jaxba._atomic import write_atomically, write_folder_atomically\nplace = sys.argv[1]\n"
         "with write_folder_atomically(place + '/made'), write_atomically(place + '/out'):\n    os._exit(1)"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)

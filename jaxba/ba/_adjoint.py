@@ -96,6 +96,7 @@ def _optimum_jvp(
     system_dot, start_dot = (_zeros_for_none(p, t) for p, t in zip(primals, tangents, strict=True))
     try:
         near, equations = _at_the_optimum(*jax.lax.stop_gradient((system, found.unknowns)), exact)
+        equations = _require_minimum(equations)
         unknowns = jax.tree.map(lambda a, b: a + jax.lax.stop_gradient(b - a), found.unknowns, near)
         tell_held(jnp.sum(system.free.points[:, 0]), jnp.sum(equations.system.free.points[:, 0]))
         moved = _moved(system, unknowns, equations, system_dot, start_dot)
@@ -174,12 +175,13 @@ def _newton(equations: "_Equations", unknowns: Unknowns) -> Unknowns:
 
 
 class _Equations(NamedTuple):
-    """H at some unknowns, factored; what a bound holds is fixed in its system."""
+    """H at some unknowns, factored; what a bound holds is fixed in its system. `pivot`: see `smallest_pivot`."""
 
     system: System
     model: Linearisation
     reduced: Reduced
     factored: Factored
+    pivot: Float[Array, ""]
     at_lower: Float[Array, "cameras parameters"]
     at_upper: Float[Array, "cameras parameters"]
 
@@ -213,7 +215,21 @@ def _equations(system: System, unknowns: Unknowns, exact: bool) -> _Equations:
     if exact:
         system, model = hold_saddles(system, model)
     reduced = eliminate_points(system, model, one_for_fixed(system, jax.tree.map(jnp.zeros_like, system.free)))
-    return _Equations(system, model, reduced, factor_reduced(system, reduced), at_lower, at_upper)
+    factored = factor_reduced(system, reduced)
+    return _Equations(system, model, reduced, factored, smallest_pivot(system, reduced, factored), at_lower, at_upper)
+
+
+def _require_minimum(equations: _Equations) -> _Equations:
+    """Return the equations; raise where H is singular, also from inside a jit.
+
+    It stands outside of what is compiled for the values that are known: jax keeps no program that calls back.
+    """
+    singular = ~(equations.pivot > SINGULAR)
+    if is_traced(singular):
+        return eqx.error_if(equations, singular, NOT_A_MINIMUM)
+    if singular:
+        raise JaxbaError(NOT_A_MINIMUM)
+    return equations
 
 
 def hold_saddles(system: System, model: Linearisation) -> tuple[System, Linearisation]:
@@ -240,8 +256,6 @@ def _moved(system: System, unknowns: Unknowns, equations: _Equations, system_dot
         jnp.where(jnp.isfinite(bound), dot, 0.0)
         for bound, dot in ((system.lower, system_dot.lower), (system.upper, system_dot.upper))
     ]
-    pivot = smallest_pivot(equations.system, equations.reduced, equations.factored)
-    equations = eqx.error_if(equations, ~(pivot > SINGULAR), NOT_A_MINIMUM)
     free = equations.system.free
     intrinsics_dot = jnp.where(equations.at_upper > 0, bounds_dot[1], start_dot.intrinsics)
     intrinsics_dot = jnp.where(equations.at_lower > 0, bounds_dot[0], intrinsics_dot)

@@ -79,8 +79,8 @@ def tune(
     - `check_points`: indices (or a mask) and true coordinates of points whose coordinates the fit does not know, or
     - `hold_out`: the share of the observations to leave out of the fit, fewer where points would not keep two each.
     - `optimizer`: of optax; `optax.adam(learning_rate)` if None.
-    - `starts`: how many descents, from start values spread by a factor of e, at once (`vmap`). `seed`: of the starts
-      and of what is held out.
+    - `starts`: how many descents, from start values spread by a factor of e, side by side. `seed`: of the starts and
+      of what is held out.
     - `callback`: called with the number of each step and the scores. Ctrl-C ends with the best so far.
 
     Needs optax: `pip install 'jaxba[tune]'`.
@@ -123,8 +123,8 @@ def tune(
         parameters = np.tile(_given(loss, learn), (starts, 1))
         parameters[1:] += _SPREAD * rng.normal(size=parameters[1:].shape)
         values = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (starts, *np.shape(leaf))), _values(first))
-        evaluate = _evaluation(problem, loss, learn, plan, score, starts)
-        approximate = _evaluation(problem, loss, learn, plan, score, starts, "gauss_newton")
+        evaluate = _evaluation(problem, loss, learn, plan, score)
+        approximate = _evaluation(problem, loss, learn, plan, score, "gauss_newton")
         state = rule.init(jnp.asarray(parameters))
         history, best, stopped, approximate_steps = [], (np.inf, parameters[0], _start(values, 0)), "", 0
         try:
@@ -223,7 +223,6 @@ def _evaluation(
     learn: Sequence[str],
     plan: Plan,
     score: Callable[[Solution], Float[Array, ""]],
-    starts: int,
     adjoint: Adjoint = "implicit",
 ) -> Callable[[Any, Any], Any]:
     """Return the function from parameters and start values, a row a start, to ((scores, optima), gradients)."""
@@ -236,14 +235,13 @@ def _evaluation(
         return score(found), jax.lax.stop_gradient(_values(found))
 
     of_one = jax.value_and_grad(one, has_aux=True)
-    if starts > 1:
-        return eqx.filter_jit(jax.vmap(of_one))  # its errors can be caught
 
-    def alone(parameters: Any, values: Any) -> Any:  # outside of jit, the steps are those of an ordinary solve
-        found = of_one(parameters[0], _start(values, 0))
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], found)
+    def evaluate(parameters: Any, values: Any) -> Any:
+        # outside of jit and vmap, the steps are those of an ordinary solve, and its programs serve every start
+        rows = [of_one(of_start, _start(values, start)) for start, of_start in enumerate(parameters)]
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
-    return alone
+    return evaluate
 
 
 def _values(solution: Solution) -> tuple[Any, ...]:

@@ -222,7 +222,7 @@ def _evaluation(
     loss: AbstractLoss,
     learn: Sequence[str],
     plan: Plan,
-    score: Callable[[Solution], Float[Array, ""]],
+    score: Callable[[Any], Float[Array, ""]],
     adjoint: Adjoint = "implicit",
 ) -> Callable[[Any, Any], Any]:
     """Return the function from parameters and start values, a row a start, to ((scores, optima), gradients)."""
@@ -232,7 +232,7 @@ def _evaluation(
         values = jax.lax.stop_gradient(values)
         of_problem = eqx.tree_at(lambda p: (p.poses, p.cameras, p.points, p.lever_arm), of_problem, values)
         found = solve(of_problem, loss=of_loss, plan=plan, adjoint=adjoint)
-        return score(found), jax.lax.stop_gradient(_values(found))
+        return score(_values(found)), jax.lax.stop_gradient(_values(found))
 
     of_one = jax.value_and_grad(one, has_aux=True)
 
@@ -252,9 +252,36 @@ def _start(values: Any, start: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[start], values)
 
 
-def _check_point_score(
-    problem: Problem, index: Selection, xyz: Float[np.ndarray, "n 3"]
-) -> Callable[[Solution], Float[Array, ""]]:
+class _CheckPointScore(eqx.Module):
+    """Mean squared distance of check points, of `_values`."""
+
+    index: Int[np.ndarray, " n"]
+    xyz: Float[np.ndarray, "n 3"]
+
+    @eqx.filter_jit
+    def __call__(self, values: Any) -> Float[Array, ""]:
+        _, _, points, _ = values
+        return jnp.mean(jnp.sum((jnp.asarray(points)[self.index] - self.xyz) ** 2, axis=1))
+
+
+class _HeldOutScore(eqx.Module):
+    """Mean robust error of observations, of `_values`; `camera`: of each."""
+
+    left_out: Observations
+    camera: Int[np.ndarray, " n"]
+
+    @eqx.filter_jit
+    def __call__(self, values: Any) -> Float[Array, ""]:
+        seen = self.left_out
+        poses, cameras, points, _ = values
+        poses = jax.tree.map(lambda leaf: jnp.asarray(leaf)[seen.image_index], poses)
+        cameras = jax.tree.map(lambda leaf: jnp.asarray(leaf)[self.camera], cameras)
+        pixel = cameras.project(poses.transform(jnp.asarray(points)[seen.point_index]))
+        squared = jnp.sum((pixel - seen.xy_px) ** 2, axis=1) / seen.std_px**2
+        return jnp.mean(squared / (squared + _HELD_OUT_SIGMAS**2))
+
+
+def _check_point_score(problem: Problem, index: Selection, xyz: Float[np.ndarray, "n 3"]) -> _CheckPointScore:
     chosen = selected("tune: check_points", index, problem.num_points, "points")
     index, xyz = np.asarray(index), np.asarray(xyz, float)
     index = np.flatnonzero(chosen) if index.dtype == bool else index.reshape(-1)
@@ -272,15 +299,10 @@ def _check_point_score(
                 "fitted."
             )
 
-    def score(solution: Solution) -> Float[Array, ""]:
-        return jnp.mean(jnp.sum((jnp.asarray(solution.points)[index] - xyz) ** 2, axis=1))
-
-    return score
+    return _CheckPointScore(index, xyz)
 
 
-def _held_out_score(
-    problem: Problem, share: float, rng: np.random.Generator
-) -> tuple[Problem, Callable[[Solution], Float[Array, ""]]]:
+def _held_out_score(problem: Problem, share: float, rng: np.random.Generator) -> tuple[Problem, _HeldOutScore]:
     """Return the problem without the observations held out, and their score."""
     if not 0 < share < 1:
         raise JaxbaError(f"tune: hold_out={share:g}: give a share of the observations, such as 0.1.")
@@ -303,11 +325,4 @@ def _held_out_score(
     left_out = part(out)
     camera = np.asarray(problem.camera_index)[left_out.image_index]
 
-    def score(solution: Solution) -> Float[Array, ""]:
-        poses = jax.tree.map(lambda leaf: jnp.asarray(leaf)[left_out.image_index], solution.poses)
-        cameras = jax.tree.map(lambda leaf: jnp.asarray(leaf)[camera], solution.cameras)
-        pixel = cameras.project(poses.transform(jnp.asarray(solution.points)[left_out.point_index]))
-        squared = jnp.sum((pixel - left_out.xy_px) ** 2, axis=1) / left_out.std_px**2
-        return jnp.mean(squared / (squared + _HELD_OUT_SIGMAS**2))
-
-    return dataclasses.replace(problem, observations=part(kept)), score
+    return dataclasses.replace(problem, observations=part(kept)), _HeldOutScore(left_out, camera)

@@ -128,7 +128,7 @@ def adjust(
         mark_used = agreeing_marks(block, control)
         found, limit_px = judge(block, tracks, solved.error_px, limit_px, settings)
         if len(medians) > 1:  # what the first round's held intrinsics leave is no edge's fault
-            edge_px = edge_medians_px(matches, found, len(view_graph.pairs), tracks.num_observations)
+            edge_px = edge_medians_px(matches, found, block, tracks, len(view_graph.pairs))
             worst, warnings = edges_to_prune(view_graph, edge_px, settings.edge_median_limit, photos)
             notes = warnings
             if worst:

@@ -14,12 +14,13 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from jaxba.scene import Photo, PrunedEdge, Tracks, ViewGraph
+from jaxba.scene import Block, Photo, PrunedEdge, Tracks, ViewGraph
 from jaxba.sfm._points import Triangulated
-from jaxba.sfm._rays import Rays
+from jaxba.sfm._rays import Rays, make_rays
 
 _LEAST_MATCHES = 5  # fewer have no median to speak of
 _MAX_PRUNED = 0.3  # of the edges: more of them over the limit speak of the block, not of the edges
+_PIECE = 500_000  # matches worked on at a time
 _FAR = 10.0  # times the limit of an edge: no bent block explains it
 
 
@@ -56,18 +57,23 @@ def match_rows(view_graph: ViewGraph, tracks: Tracks) -> MatchRows:
 
 
 def edge_medians_px(
-    matches: MatchRows, found: Triangulated, num_edges: int, num_rows: int
+    matches: MatchRows, found: Triangulated, block: Block, tracks: Tracks, num_edges: int
 ) -> Float[np.ndarray, " edges"]:
     """Return the median error of each edge's matches between registered images, pixels; NaN where there are few.
 
-    `num_rows`: of the tracks.
+    - `found`: of the block's images and the tracks.
     """
-    place = np.full(num_rows, -1)
+    place = np.full(tracks.num_observations, -1)
     place[found.row] = np.arange(len(found.row))
     first, second = place[matches.first], place[matches.second]
     both = (first >= 0) & (second >= 0)
     edge, first, second = matches.edge[both], first[both], second[both]
-    error = epipolar_px(found.rays.take(first), found.rays.take(second))
+    error = np.zeros(len(edge))
+    for start in range(0, len(edge), _PIECE):
+        here = slice(start, start + _PIECE)
+        rows, (one, other) = np.unique((first[here], second[here]), return_inverse=True)
+        rays = make_rays(block, found.image_row[rows], tracks.xy_px[found.row[rows]])
+        error[here] = epipolar_px(rays.take(one), rays.take(other))
     for side in (first, second):
         of_point = np.where(found.is_point[found.of_track[side]], found.error_px[side], 0.0)
         error = np.fmax(error, of_point)

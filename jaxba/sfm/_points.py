@@ -18,6 +18,7 @@ are wrong.
 
 import dataclasses
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -28,6 +29,7 @@ from jaxba.sfm._rays import Rays, make_rays
 
 _MAX_PAIRS = 45  # of one track's rays: all of them up to ten rays
 _CONSENSUS_SIZE = 1_000_000  # errors computed at a time
+_PIECE = 500_000  # rows worked on at a time: some 0.6 kB each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +52,6 @@ class Triangulated:
     error_px: Float[np.ndarray, " rows"]
     is_used: Bool[np.ndarray, " rows"]
     is_point: Bool[np.ndarray, " tracks"]
-    rays: Rays
 
 
 def with_points(block: Block, tracks: Tracks, *, min_angle_rad: float, max_error_px: float) -> Block:
@@ -108,33 +109,32 @@ def triangulate_tracks(
             "0 to 3.1, such as 2 px and 0.026."
         )
     row, image_row, of_track, track_index = track_rows(block, tracks)
-    rays = make_rays(block, image_row, tracks.xy_px[row])
-    starts = np.searchsorted(of_track, np.arange(len(track_index)))
-    counts = np.diff(starts, append=len(row))
-    if not len(row):
-        nothing, none = np.zeros(0), np.zeros(0, bool)
-        return Triangulated(row, image_row, of_track, track_index, np.zeros((0, 3)), nothing, none, none, rays)
+    counts, middle_m = np.bincount(of_track, minlength=len(track_index)), block.centers_m.mean(axis=0)
     limit_px = np.full(len(row), float(max_error_px))
     if by_redundancy:
         limit_px /= redundancy_root(counts)[of_track]
-    problem = _Tracks(rays, of_track, starts, counts, block.centers_m.mean(axis=0), limit_px)
+    point, error = np.zeros((3, len(counts))), np.zeros(len(row))
+    is_used, is_point = np.zeros(len(row), bool), np.zeros(len(counts), bool)
+    for piece, rows in pieces(counts, _PIECE):
+        rays = make_rays(block, image_row[rows], tracks.xy_px[row[rows]])
+        problem = _Tracks.of(rays, counts[piece], middle_m, limit_px[rows])
+        found = problem.triangulated(min_angle_rad)
+        point[:, piece], error[rows], is_used[rows], is_point[piece] = found
+    return Triangulated(row, image_row, of_track, track_index, point.T.copy(), error, is_used, is_point)
 
-    used = np.isfinite(rays.direction[0])
-    usable, agree = used, np.ones(len(row), bool)
-    point, error = problem.solve(used)
-    with np.errstate(invalid="ignore"):
-        doubtful = np.logical_or.reduceat(used & ~(error <= limit_px), starts) & (counts > 2)
-    if doubtful.any():
-        used = problem.consensus(np.flatnonzero(doubtful), used)
-        for _ in range(2):
-            point, error = problem.solve(used)
-            used = error <= limit_px  # all are judged anew: what was left out may fit the better point
-        agree = (np.add.reduceat(used, starts) >= 2)[of_track]
-        point, error = problem.solve(np.where(agree, used, usable))
-    is_used = (error <= limit_px) & agree
-    is_point = (np.add.reduceat(is_used, starts) >= 2) & np.isfinite(point).all(axis=0)
-    is_point &= problem.largest_angle(is_used) >= min_angle_rad
-    return Triangulated(row, image_row, of_track, track_index, point.T.copy(), error, is_used, is_point, rays)
+
+def pieces(counts: Int[np.ndarray, " groups"], most: int) -> Iterator[tuple[slice, slice]]:
+    """Cut groups of rows, one after the other, into pieces of about `most` rows: slices of the groups, and of the rows.
+
+    >>> [(groups.stop, rows.stop) for groups, rows in pieces(np.array([2, 2, 5, 1]), 4)]
+    [(2, 4), (3, 9), (4, 10)]
+    """
+    ends = np.cumsum(counts)
+    first = first_row = 0
+    while first < len(counts):
+        last = max(int(np.searchsorted(ends, first_row + most, side="right")), first + 1)
+        yield slice(first, last), slice(first_row, int(ends[last - 1]))
+        first, first_row = last, int(ends[last - 1])
 
 
 def redundancy_root(views: Int[np.ndarray, " tracks"]) -> Float[np.ndarray, " tracks"]:
@@ -169,6 +169,37 @@ class _Tracks:
     counts: Int[np.ndarray, " tracks"]
     middle_m: Float[np.ndarray, "3"]
     limit_px: Float[np.ndarray, " rows"]
+
+    @staticmethod
+    def of(
+        rays: Rays,
+        counts: Int[np.ndarray, " tracks"],
+        middle_m: Float[np.ndarray, "3"],
+        limit_px: Float[np.ndarray, " rows"],
+    ) -> "_Tracks":
+        return _Tracks(
+            rays, np.repeat(np.arange(len(counts)), counts), np.cumsum(counts) - counts, counts, middle_m, limit_px
+        )
+
+    def triangulated(self, min_angle_rad: float) -> tuple[np.ndarray, ...]:
+        """Return points, errors, which rows are used and which tracks have a point, as `Triangulated` has them."""
+        starts, limit_px = self.starts, self.limit_px
+        used = np.isfinite(self.rays.direction[0])
+        usable, agree = used, np.ones(len(used), bool)
+        point, error = self.solve(used)
+        with np.errstate(invalid="ignore"):
+            doubtful = np.logical_or.reduceat(used & ~(error <= limit_px), starts) & (self.counts > 2)
+        if doubtful.any():
+            used = self.consensus(np.flatnonzero(doubtful), used)
+            for _ in range(2):
+                point, error = self.solve(used)
+                used = error <= limit_px  # all are judged anew: what was left out may fit the better point
+            agree = (np.add.reduceat(used, starts) >= 2)[self.of_track]
+            point, error = self.solve(np.where(agree, used, usable))
+        is_used = (error <= limit_px) & agree
+        is_point = (np.add.reduceat(is_used, starts) >= 2) & np.isfinite(point).all(axis=0)
+        is_point &= self.largest_angle(is_used) >= min_angle_rad
+        return point, error, is_used, is_point
 
     def solve(
         self, used: Bool[np.ndarray, " rows"]

@@ -35,10 +35,11 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import Covariance, covariance
 from jaxba.scene import Block, Reference
 from jaxba.sfm._adjust import Adjusted
-from jaxba.sfm._points import redundancy_root
+from jaxba.sfm._points import pieces, redundancy_root
 from jaxba.sfm._problem import used_positions
 from jaxba.sfm._rays import make_rays
 
+_PIECE = 500_000  # observations worked on at a time
 _LEAST_REDUNDANCY = 30  # to tell how errors are spread
 _LEAST_TRACKS, _LEAST_FREEDOM = 100, 3  # to tell how variances are distributed
 _FREEDOM = np.geomspace(3.0, 1000.0, 400)  # of that distribution; at the last, all tracks are alike
@@ -135,15 +136,20 @@ def with_own_errors(
 
 def own_variance(block: Block, std_px: float) -> Float[np.ndarray, "points 3"]:
     """Return the variances of points that their own observations account for, poses and cameras known, in m^2."""
-    rays = make_rays(block, block.observation_image, block.observation_xy_px)
-    distance = rays.errors_px(block.points_m[block.observation_point].T)[1]
     order = np.argsort(block.observation_point, kind="stable")
-    by_point = (rays.by_point / (distance * std_px))[..., order]
-    starts = np.searchsorted(block.observation_point[order], np.arange(block.num_points))
-    normal = np.add.reduceat(np.einsum("cin,cjn->nij", by_point, by_point), starts, axis=0)
-    normal[~np.isfinite(normal).all(axis=(1, 2))] = 0.0
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    return np.maximum(np.einsum("nii->ni", inverse), 0.0)
+    variance = np.zeros((block.num_points, 3))
+    counts = np.bincount(block.observation_point, minlength=block.num_points)
+    for points, rows in pieces(counts, _PIECE):
+        seen = order[rows]
+        rays = make_rays(block, block.observation_image[seen], block.observation_xy_px[seen])
+        distance = rays.errors_px(block.points_m[block.observation_point[seen]].T)[1]
+        by_point = rays.by_point / (distance * std_px)
+        starts = np.cumsum(counts[points]) - counts[points]
+        normal = np.add.reduceat(np.einsum("cin,cjn->nij", by_point, by_point), starts, axis=0)
+        normal[~np.isfinite(normal).all(axis=(1, 2))] = 0.0
+        inverse = np.linalg.pinv(normal, hermitian=True)
+        variance[points] = np.maximum(np.einsum("nii->ni", inverse), 0.0)
+    return variance
 
 
 def own_factors(block: Block, error_px: Float[np.ndarray, " observations"]) -> Float[np.ndarray, " points"]:

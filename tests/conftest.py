@@ -88,7 +88,7 @@ def _unload_programs() -> None:
     waits for ever.
     """
     maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+    if maps.exists() and maps.read_bytes().count(b"\n") > 40_000:
         gc.unfreeze()
         jax.clear_caches()
         gc.collect()

@@ -125,5 +125,5 @@ def _scale_bar(axes: "Axes", unit: str) -> None:
 
 def _png(image: Any) -> bytes:
     buffer = io.BytesIO()
-    image.save(buffer, "png", optimize=True)
+    image.save(buffer, "png")
     return buffer.getvalue()

@@ -11,6 +11,9 @@ them are solved in one piece as well. `--shapes`: in place of all that, blocks o
 `--max-memory`.
 Prints the seconds of a first call, which compiles, and the peak of memory.
 
+`--batch`: in place of all that, 64 blocks of 20 to 50 images by `solve_batch`, by `solve` one after another, and every
+eighth of them by scipy. Prints the medians of three rounds, what was compiled before them, and the processor's seconds.
+
 `--merge`: in place of all that, what it costs to adjust tiles each on its own and merge them. The same block of 400
 images, with GNSS, and with control points as well, is adjusted exactly, and in 4 and 9 tiles that are merged, with and
 without the global pass. Prints the cost over the exact one, rms distances of camera centres and points from the exact
@@ -36,7 +39,9 @@ import jax
 import numpy as np
 
 import jaxba
-from jaxba import Problem
+from benchmarks.peers.scipy_trf import solve_with_scipy
+from jaxba import Problem, Solution
+from jaxba.geometry import Linear
 from jaxba.simulation.synthetic import Truth
 
 _SHAPES: dict[str, dict[str, Any]] = {
@@ -59,6 +64,7 @@ def main() -> None:
     parser.add_argument("--whole", type=int, nargs="*", default=[1000, 4000])
     parser.add_argument("--max-memory", default="4GB")
     parser.add_argument("--shapes", action="store_true")
+    parser.add_argument("--batch", action="store_true")
     parser.add_argument("--merge", action="store_true")
     parser.add_argument("--covariance", type=int, nargs="*")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
@@ -71,6 +77,9 @@ def main() -> None:
         return
     if options.covariance is not None:
         _covariance(options.covariance or [1000, 4000, 16000], options.max_memory)
+        return
+    if options.batch:
+        _batch()
         return
     if options.merge:
         _merge()
@@ -181,6 +190,43 @@ def _one(way: str, file: str, options: str) -> None:
 def _peak() -> float:
     """Return the most bytes that this process has held."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
+
+
+def _batch() -> None:
+    sizes = np.random.default_rng(0).integers(20, 51, 64)
+    problems = [
+        jaxba.synthetic.uav_block(int(size), seed=seed, side_overlap=0.7).problem for seed, size in enumerate(sizes)
+    ]
+    print(f"64 blocks of 20 to 50 images, {sum(problem.num_observations for problem in problems):,} observations")
+    print("| way | first call (s) | a call (s) | processor (s) | largest cost over the one of solve |")
+    print("| --- | --- | --- | --- | --- |")
+    ways: dict[str, Callable[[], list[Solution]]] = {
+        "solve_batch": lambda: jaxba.solve_batch(problems),
+        "solve_batch, workers=1": lambda: jaxba.solve_batch(problems, workers=1),
+        "solve, one after another": lambda: [jaxba.solve(problem) for problem in problems],
+    }
+    first: dict[str, float] = {}
+    rounds: dict[str, list[tuple[float, float]]] = {way: [] for way in ways}
+    costs: dict[str, np.ndarray] = {}
+    for number in range(4):
+        for way, call in ways.items():  # in turn, since the machine's speed changes
+            begun, processor = time.perf_counter(), time.process_time()
+            found = call()
+            spent = time.perf_counter() - begun, time.process_time() - processor
+            if number == 0:
+                first[way] = spent[0]
+            else:
+                rounds[way].append(spent)
+            costs[way] = np.array([float(solution.final_cost) for solution in found])
+    exact = costs["solve, one after another"]
+    for way in ways:
+        seconds, processor = np.median(rounds[way], axis=0)
+        print(f"| {way} | {first[way]:.1f} | {seconds:.2f} | {processor:.2f} | {np.max(costs[way] / exact) - 1:.0e} |")
+    some = range(0, 64, 8)
+    by_scipy = [solve_with_scipy(problems[number], Linear()) for number in some]
+    seconds = sum(record.seconds_total for record in by_scipy) * 64 / len(some)
+    over = max(record.final_cost / exact[number] for number, record in zip(some, by_scipy, strict=True)) - 1
+    print(f"| scipy, from every eighth | | {seconds:.0f} | | {over:.0e} |")
 
 
 def _merge() -> None:

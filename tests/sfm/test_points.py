@@ -1,6 +1,6 @@
 """Triangulation of tracks against simulated truth and against the minimum of the reprojection error."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,8 +13,10 @@ from simulated import Simulated, simulate, true_block
 from jaxba import JaxbaError
 from jaxba.geometry import OpenCV
 from jaxba.scene import Block
-from jaxba.sfm import with_points
-from jaxba.sfm._points import triangulate_tracks
+from jaxba.sfm import _edges, _points, _uncertainty, with_points
+from jaxba.sfm._edges import edge_medians_px, match_rows
+from jaxba.sfm._points import Triangulated, apply_points, triangulate_tracks
+from jaxba.sfm._uncertainty import own_variance
 
 ANGLE = 0.02
 
@@ -114,6 +116,27 @@ def test_points_behind_the_cameras_are_left_out(exact: Simulated) -> None:
     block = true_block(exact)
     mirrored = replace(block, translation_m=-block.translation_m)  # centres mirrored: rays meet behind
     assert with_points(mirrored, exact.tracks, min_angle_rad=ANGLE, max_error_px=1.0).num_points == 0
+
+
+def test_pieces_give_what_one_piece_gives(noisy: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
+    # breaks where a track or a match is cut, or taken from a neighbour's rows
+    block, tracks = true_block(noisy), noisy.tracks
+    num_edges = len(noisy.view_graph.pairs)
+
+    def made() -> tuple[Triangulated, np.ndarray, np.ndarray]:
+        found = triangulate_tracks(block, tracks, ANGLE, 2.0, by_redundancy=True)
+        medians = edge_medians_px(match_rows(noisy.view_graph, tracks), found, block, tracks, num_edges)
+        return found, medians, own_variance(apply_points(block, tracks, found), 0.5)
+
+    whole, medians, variance = made()
+    assert np.isfinite(medians).any()
+    for module, rows in ((_points, 2000), (_edges, 5000), (_uncertainty, 3001)):
+        monkeypatch.setattr(module, "_PIECE", rows)
+    cut, cut_medians, cut_variance = made()
+    for field in fields(Triangulated):
+        np.testing.assert_array_equal(getattr(cut, field.name), getattr(whole, field.name), err_msg=field.name)
+    np.testing.assert_array_equal(cut_medians, medians)
+    np.testing.assert_array_equal(cut_variance, variance)
 
 
 def test_limits_out_of_range_are_refused(exact: Simulated) -> None:

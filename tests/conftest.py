@@ -85,7 +85,7 @@ def _unload_programs() -> None:
     """Forget what jax has compiled, once it is much.
 
     A compiled program holds several memory mappings, of which Linux grants a process 65,530; beyond them the compiler
-    waits for ever.
+    waits for ever. The tests of one file take 19,000 at most.
     """
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > 40_000:

@@ -21,7 +21,7 @@ from jaxba._sizes import free_memory, size_text
 from jaxba.ba._compiler import compiler_options
 from jaxba.ba._linearise import cost
 from jaxba.ba._solution import HistoryStep
-from jaxba.ba._solvers import RUNNING, AbstractSchurSolver, State
+from jaxba.ba._solvers import RUNNING, AbstractSchurSolver, State, take_numbers
 from jaxba.ba._system import System, without_losses
 from jaxba.ba._unknowns import Unknowns
 
@@ -117,37 +117,43 @@ class Compiled(NamedTuple):
     - `step_bytes`: what a step takes beside its arguments.
     """
 
-    init: jax.stages.Compiled
-    step: jax.stages.Compiled
-    cost: jax.stages.Compiled
+    init: Callable[[Unknowns, System], State]
+    step: Callable[[Unknowns, State, System], tuple[Unknowns, State]]
+    cost: Callable[[System, Unknowns], Float[Array, ""]]
     step_bytes: float
 
 
 def compiled(solver: AbstractSchurSolver, unknowns: Unknowns, system: System, plain: System) -> Compiled:
-    """Return the solver's functions for these arguments' shapes; `plain` is the system without robust losses."""
-    leaves, structure = jax.tree.flatten((unknowns, system, plain))
+    """Return the solver's functions for these arguments' shapes; `plain` is the system without robust losses.
+
+    Solvers that differ in tolerances or their first trust share them.
+    """
+    numbers, rest = take_numbers(solver, unknowns.points.dtype)
+    leaves, structure = jax.tree.flatten((numbers, unknowns, system, plain))
     shapes = tuple((leaf.shape, leaf.dtype.name) for leaf in leaves)
-    return _compile(solver, structure, shapes)
+    run = _compile(rest, structure, shapes)
+    return run._replace(init=functools.partial(run.init, numbers), step=functools.partial(run.step, numbers))
 
 
 @functools.lru_cache(maxsize=_KEPT)
-def _compile(solver: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]) -> Compiled:
+def _compile(rest: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]) -> Compiled:
+    """Return the functions; `init` and `step` take the solver's numbers first."""
     arguments = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
-    unknowns, system, plain = jax.tree.unflatten(structure, arguments)
+    numbers, unknowns, system, plain = jax.tree.unflatten(structure, arguments)
 
-    def init(unknowns: Unknowns, system: System) -> State:
-        return solver.init(None, unknowns, system, None, None, None, frozenset())
+    def init(numbers: AbstractSchurSolver, unknowns: Unknowns, system: System) -> State:
+        return eqx.combine(numbers, rest).init(None, unknowns, system, None, None, None, frozenset())
 
-    def step(unknowns: Unknowns, state: State, system: System) -> tuple[Unknowns, State]:
-        return solver.step(None, unknowns, system, None, state, frozenset())[:2]
+    def step(numbers: AbstractSchurSolver, unknowns: Unknowns, state: State, system: System) -> tuple[Unknowns, State]:
+        return eqx.combine(numbers, rest).step(None, unknowns, system, None, state, frozenset())[:2]
 
     def plain_cost(system: System, unknowns: Unknowns) -> Float[Array, ""]:
         return cost(system, unknowns)
 
-    state = eqx.filter_eval_shape(init, unknowns, system)
+    state = eqx.filter_eval_shape(init, numbers, unknowns, system)
     lowered = (
-        jax.jit(step).lower(unknowns, state, system),
-        jax.jit(init).lower(unknowns, system),
+        jax.jit(step).lower(numbers, unknowns, state, system),
+        jax.jit(init).lower(numbers, unknowns, system),
         jax.jit(plain_cost).lower(plain, unknowns),
     )
     # the steps of a large program run long enough to pay for the optimisations

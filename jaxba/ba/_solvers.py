@@ -114,6 +114,15 @@ def require_stops(label: str, *, max_nfev: int, ftol: float, xtol: float, gtol: 
     return int(max_nfev)
 
 
+def take_numbers(solver: "AbstractSchurSolver", dtype: Any) -> tuple["AbstractSchurSolver", "AbstractSchurSolver"]:
+    """Return the solver's numbers as arrays, and the solver without them; `eqx.combine` puts the two together.
+
+    As arguments of a program they may change without its being compiled anew.
+    """
+    numbers, rest = eqx.partition(solver, lambda leaf: isinstance(leaf, float))
+    return jax.tree.map(lambda number: np.asarray(number, dtype), numbers), rest
+
+
 def residuals(unknowns: Unknowns, system: System) -> tuple[Float[Array, "components *rows"], ...]:
     """Return every group's robust residuals `sqrt(rho(s) / s) r`, `s = |r|^2`: their squares sum to twice the cost."""
 

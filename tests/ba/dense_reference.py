@@ -7,9 +7,7 @@ of the same sizes, whatever of them is free and whatever their losses.
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +18,9 @@ from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 
 from jaxba.ba import Problem, Step, Unknowns
+from jaxba.ba._descend import descend
 from jaxba.ba._plan import LinearSolver, Plan, make_plan
-from jaxba.ba._solvers import RUNNING, AbstractSchurSolver, State
+from jaxba.ba._solvers import AbstractSchurSolver, State
 from jaxba.ba._system import System, initial_unknowns, make_system, restore
 from jaxba.geometry import AbstractLoss, Linear, Pose
 
@@ -67,25 +66,8 @@ def minimise(
 ) -> Minimum:
     """Run the solver step by step from the problem's start values, at most 300 steps."""
     plan, system, unknowns = solver_view(problem, loss, linear_solver)
-    init, step = _init_and_step(solver)
-    unknowns, state = jax.device_get((unknowns, init(unknowns, system)))
-    for _ in range(300):
-        # fetched, the first step's arguments have the types of the others', and share their program
-        unknowns, state = jax.device_get(step(unknowns, state, system))
-        if int(state.status) != RUNNING:
-            break
-    return Minimum(restore(unknowns, plan), state, plan)
-
-
-@functools.cache
-def _init_and_step(solver: AbstractSchurSolver) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    def init(unknowns: Unknowns, system: System) -> State:
-        return solver.init(None, unknowns, system, None, None, None, frozenset())
-
-    def step(unknowns: Unknowns, state: State, system: System) -> tuple[Unknowns, State]:
-        return solver.step(None, unknowns, system, None, state, frozenset())[:2]
-
-    return quick_jit(init), quick_jit(step)
+    reached = descend(solver, unknowns, system, 300)
+    return Minimum(restore(jax.device_get(reached.unknowns), plan), jax.device_get(reached.state), plan)
 
 
 class Group(NamedTuple):

@@ -8,6 +8,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,14 @@ from jaxtyping import Float
 from jaxba.ba._compiler import call_compiled
 from jaxba.ba._factor import box_minimum
 from jaxba.ba._linearise import Linearisation, costs
-from jaxba.ba._solvers import SchurLevenbergMarquardt, State, Tried, projected_gradient_norm
+from jaxba.ba._solvers import (
+    AbstractSchurSolver,
+    SchurLevenbergMarquardt,
+    State,
+    Tried,
+    projected_gradient_norm,
+    take_numbers,
+)
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.ba.tiles._dense import NotPositive
@@ -28,7 +36,9 @@ class Stepper:
     """Takes steps of a solver with an engine."""
 
     def __init__(self, engine: Engine, solver: SchurLevenbergMarquardt) -> None:
-        self.engine, self.solver = engine, solver
+        self.engine = engine
+        self._numbers, rest = take_numbers(solver, np.float64)
+        self._judge = _judge_with(rest)
 
     def compile(self, unknowns: Unknowns) -> None:
         """Compile what a step calls, side by side; without it that happens at the first one."""
@@ -40,7 +50,7 @@ class Stepper:
         try:
             up = self.engine.up(self.engine.step_equations(unknowns, damping, bend), damping)
         except NotPositive:
-            return unknowns, call_compiled(_judge_with(self.solver), state, jax.tree.map(np.asarray, _NOTHING_TRIED))
+            return unknowns, call_compiled(self._judge, self._numbers, state, jax.tree.map(np.asarray, _NOTHING_TRIED))
         trial, sums, squared_norm = self._down(unknowns, self._border(unknowns, up.update), damping, bend)
         gradient = up.gradient
         of_all = Step(gradient.poses, gradient.intrinsics, gradient.lever_arm, np.array([[up.steepest, 0.0, 0.0]]))
@@ -56,7 +66,7 @@ class Stepper:
             "norm": np.sqrt(squared_norm),
             "points_held": int(sums.points_held),
         }
-        judged = call_compiled(_judge_with(self.solver), state, jax.tree.map(np.asarray, tried))
+        judged = call_compiled(self._judge, self._numbers, state, jax.tree.map(np.asarray, tried))
         return (trial if judged.accepted else unknowns), judged
 
     def _border(self, unknowns: Unknowns, top: Float[np.ndarray, "tail tail"]) -> Float[np.ndarray, " border"]:
@@ -150,8 +160,8 @@ def _calls_of_step(system: System, part: Unknowns, model: Linearisation) -> list
 
 
 @functools.cache
-def _judge_with(solver: SchurLevenbergMarquardt) -> Callable[[State, dict[str, Any]], State]:
-    return lambda state, tried: solver.judge(state, Tried(**tried))
+def _judge_with(rest: AbstractSchurSolver) -> Callable[[AbstractSchurSolver, State, dict[str, Any]], State]:
+    return lambda numbers, state, tried: eqx.combine(numbers, rest).judge(state, Tried(**tried))
 
 
 _NOTHING_TRIED: dict[str, Any] = {

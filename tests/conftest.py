@@ -1,4 +1,4 @@
-"""Every test runs in float64, with the shapes and types of each annotated function and class checked at run time.
+"""Every test runs in float64, with the shapes and types of annotated functions and classes checked at run time.
 
 What was compiled once, by these tests, the commands that they start, or `python -m jaxba`, is not compiled again: they
 share one cache on the disk.
@@ -6,6 +6,7 @@ share one cache on the disk.
 
 import gc
 import os
+import pkgutil
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ import jax
 import jaxtyping
 import pytest
 
+import jaxba
 from jaxba.engine._compile_cache import use_compilation_cache
 
 if TYPE_CHECKING:
@@ -29,7 +31,12 @@ use_compilation_cache()
 # the same examples each time, however long one takes on a machine that is busy
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")
-jaxtyping.install_import_hook("jaxba", "beartype.beartype")  # works only on modules that are not imported yet
+# works only on modules that are not imported yet. The engine holds no arrays: files and settings, in calls by the ten
+# thousand, whose types pyright knows
+jaxtyping.install_import_hook(
+    [f"jaxba.{module.name}" for module in pkgutil.iter_modules(jaxba.__path__) if module.name != "engine"],
+    "beartype.beartype",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

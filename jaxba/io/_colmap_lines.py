@@ -40,13 +40,13 @@ def claim(places: dict[int, str], number: int, place: str, kind: str) -> None:
 
 
 class Damage:
-    """Turns what goes wrong with a line into an error that names it."""
+    """Turns what goes wrong with a line into an error that names it; one may serve a loop, its `place` set by line."""
 
     def __init__(self, place: str) -> None:
         self.place = place
 
-    def __enter__(self) -> None:
-        pass
+    def __enter__(self) -> "Damage":
+        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if isinstance(error, ValueError | IndexError | OverflowError):

@@ -146,19 +146,19 @@ def _cameras(path: Path) -> tuple[str, list[int], Float[np.ndarray, "cameras n"]
 def _points(path: Path) -> list[_Point]:
     points: list[_Point] = []
     places: dict[int, str] = {}
-    for place, line in content_lines(path):
-        with Damage(place):
+    with Damage(str(path)) as damage:
+        for damage.place, line in content_lines(path):
             words = line.split()
-            xyz, rgb, error = finite(words[1:4]), [int(word) for word in words[4:7]], finite(words[7:8])
-            track = [int(word) for word in words[8:]]
+            *xyz, error = finite([*words[1:4], *words[7:8]])
+            rgb, track = [int(word) for word in words[4:7]], [int(word) for word in words[8:]]
             if len(words) < 8 or len(track) % 2 or not all(0 <= value <= 255 for value in rgb):
                 raise ValueError(f"{len(words)} fields, the first eight X Y Z R G B and ERROR, the others in pairs")
             point = _Point(
-                place=place, point_id=int(words[0]), xyz=xyz, rgb=rgb, error_px=error[0],
+                place=damage.place, point_id=int(words[0]), xyz=xyz, rgb=rgb, error_px=error,
                 track=list(zip(track[0::2], track[1::2], strict=True)),
             )  # fmt: skip
-        claim(places, point.point_id, place, "point")
-        points.append(point)
+            claim(places, point.point_id, point.place, "point")
+            points.append(point)
     if not points:
         raise JaxbaError(f"{path}: holds no point; export the model again.")
     return points

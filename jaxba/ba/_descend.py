@@ -117,8 +117,8 @@ class Compiled(NamedTuple):
     - `step_bytes`: what a step takes beside its arguments.
     """
 
-    init: Callable[[Unknowns, System], State]
-    step: Callable[[Unknowns, State, System], tuple[Unknowns, State]]
+    init: Callable[..., State]
+    step: Callable[..., tuple[Unknowns, State]]
     cost: Callable[[System, Unknowns], Float[Array, ""]]
     step_bytes: float
 

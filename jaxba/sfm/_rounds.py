@@ -78,6 +78,7 @@ class Rounds:
         shape: PlanShape | None,
         *,
         max_nfev: int,
+        ftol: float,
         is_later: bool,
     ) -> Solved:
         """Solve a block; `free` are the camera's parameters that may change, `shape` has the least sizes.
@@ -116,7 +117,7 @@ class Rounds:
             loss=loss,
             plan=plan,
             max_nfev=max_nfev,
-            ftol=settings.ftol,
+            ftol=ftol,
             xtol=settings.xtol,
         )
         num_points, num_own = block.num_points, block.num_observations

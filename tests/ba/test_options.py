@@ -11,7 +11,7 @@ from small_problems import RADIAL, small_problem
 
 import jaxba
 from jaxba._errors import JaxbaError
-from jaxba.ba import quality
+from jaxba.ba import _descend, quality
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt
 from jaxba.geometry import require_number
 
@@ -33,6 +33,16 @@ def test_a_tolerance_that_is_none_is_named(name: str, value: Any):
 def test_a_number_of_steps_that_is_none_is_named(value: Any):
     with pytest.raises(JaxbaError, match=r"solve: max_nfev (is|has) .*give a whole number of steps, 1 or more"):
         jaxba.solve(PROBLEM, max_nfev=value)
+
+
+def test_other_tolerances_stop_elsewhere_and_compile_nothing():
+    # breaks where a tolerance is a constant of the program, or the program keeps the first one
+    tight = jaxba.solve(PROBLEM)
+    compiled = _descend._compile.cache_info().misses
+    loose, by_steps = jaxba.solve(PROBLEM, ftol=1e-2), jaxba.solve(PROBLEM, ftol=0.0, gtol=0.0, xtol=1e-2)
+    assert _descend._compile.cache_info().misses == compiled
+    assert loose.num_steps < tight.num_steps and by_steps.num_steps < tight.num_steps
+    assert (tight.result, loose.result, by_steps.result) == ("ftol", "ftol", "xtol")
 
 
 @pytest.mark.parametrize("make", [SchurLevenbergMarquardt, SchurDogleg])

@@ -39,6 +39,7 @@ class Stage:
     - `writes_files`: what it makes are files for others, in the project's folder of exports.
     - `reads_places`: where its inputs lie counts, not their contents alone.
     - `reads_given`: its inputs are photos and lists that may have moved since.
+    - `takes_memory`: its `run` is told the bytes that it may take, which change no result.
     """
 
     module: ModuleType
@@ -50,6 +51,7 @@ class Stage:
     writes_files: bool = False
     reads_places: bool = False
     reads_given: bool = False
+    takes_memory: bool = False
 
     @property
     def name(self) -> str:

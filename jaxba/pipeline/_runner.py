@@ -131,7 +131,7 @@ def _run_stage(
         tell(Event("todo", stage.name, 0, len(waiting), by_photos=stage.is_by_photo))
     if not stage.is_by_photo:
         for item in waiting:
-            _run_whole(project, stage, item, params)
+            _run_whole(project, stage, item, params, resources)
         return collected(stage, done, items)[0], len(waiting), (), ()
     if waiting:
         stage.refuse(project.stage(stage.name), items, params, resources)
@@ -145,12 +145,13 @@ def _run_stage(
     return collected(stage, done, items)[0], len(waiting), unused, notes
 
 
-def _run_whole(project: Project, stage: Stage, item: Work, params: Parameters) -> None:
+def _run_whole(project: Project, stage: Stage, item: Work, params: Parameters, resources: Resources) -> None:
+    room = {"max_memory": resources.memory_bytes} if stage.takes_memory else {}
     if stage.writes_files:
         with write_folder_atomically(project.export) as partial:
-            outputs = stage.module.run(replace(item.inputs, folder=partial), params)
+            outputs = stage.module.run(replace(item.inputs, folder=partial), params, **room)
     else:
-        outputs = stage.module.run(item.inputs, params)
+        outputs = stage.module.run(item.inputs, params, **room)
     _store.save(item.folder, outputs, item.key)
 
 

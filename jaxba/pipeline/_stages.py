@@ -20,6 +20,7 @@ from jaxba.pipeline import adjust, control, crs, export, features, match, metada
 from jaxba.pipeline._done import Done, made
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
 from jaxba.pipeline._settings import sections
+from jaxba.pipeline._tiles import Tiles
 from jaxba.scene import LeftOut, PairRecord, Reference, ViewGraph
 
 
@@ -182,14 +183,17 @@ def _start(done: Done) -> start.Inputs:
 
 
 def _adjust(done: Done) -> adjust.Inputs:
+    tiles, block = done.settings["tiles"], made(done.start).block
+    assert isinstance(tiles, Tiles)
     return adjust.Inputs(
         photos=done.photos,
         reference=done.placed,
         view_graph=made(done.match).view_graph,
         tracks=made(done.tracks).tracks,
-        block=made(done.start).block,
+        block=block,
         features=made(done.features),
         control=made(done.control).control,
+        chunk_size=tiles.chunk_size if block.num_images > tiles.chunk_size else None,
     )
 
 
@@ -209,7 +213,7 @@ STAGES = (
     Stage(match, _match, _match_collected, lambda done: done.match_left_out),
     Stage(tracks, _tracks),
     Stage(start, _start, left_out=lambda done: done.start.block.unregistered),
-    Stage(adjust, _adjust, left_out=lambda done: done.adjust.block.unregistered),
+    Stage(adjust, _adjust, left_out=lambda done: done.adjust.block.unregistered, takes_memory=True),
     Stage(export, _export, writes_files=True),
 )
 NAMES = tuple(stage.name for stage in STAGES)

@@ -1,6 +1,6 @@
-"""The section of the settings on tiles: what `jaxba partition` cuts the block of a project into.
+"""The section of the settings on tiles: what a run solves a large block in, and `jaxba partition` cuts one into.
 
-A run itself adjusts its block whole. So another value is taken, makes no stage stale, and changes no result of a run.
+A run's tiles make up the block again: its answer is that of one piece but for rounding. So they have no overlap.
 """
 
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ from jaxba.engine._parameters import Parameters, parameter
 
 @dataclass(frozen=True, kw_only=True)
 class Tiles(Parameters):
-    """How `jaxba partition` cuts a block where its options say nothing else."""
+    """How a run cuts a block, and `jaxba partition` where its options say nothing else."""
 
     chunk_size: int = parameter(
         500,
         low=100,
         high=5000,
-        help="for jaxba partition (a run solves its block whole): images of its own that a tile has at most; more are "
-        "consistent in themselves, and take more memory",
+        help="images of its own that a tile has at most; a run solves a block of more images in tiles, to the same "
+        "answer in less memory",
     )
     overlap: int = parameter(
         50,

@@ -32,6 +32,7 @@ class Inputs:
 
     - `features`: of every photo, by its index, to complete tracks from; opened one after the other.
     - `control`: surveyed points.
+    - `chunk_size`: images of a tile, for a block that has more; None for one that has not.
     """
 
     photos: tuple[Photo, ...]
@@ -41,6 +42,7 @@ class Inputs:
     block: Block
     features: Mapping[int, Features] = field(default_factory=dict)
     control: Control = field(default_factory=Control.nothing)
+    chunk_size: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,8 +118,10 @@ class Outputs:
         return self.control.gnss_minus_control_m
 
 
-def run(inputs: Inputs, params: Params) -> Outputs:
+def run(inputs: Inputs, params: Params, max_memory: float | None = None) -> Outputs:
     """Adjust the block.
+
+    - `max_memory`: bytes that this process may hold where the block is solved in tiles; it changes no result.
 
     Raises `JaxbaError` where it has fewer than two images, or no point of it is left.
     """
@@ -126,6 +130,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     options = {f.name: getattr(params, f.name) for f in fields(params) if f.name != "min_angle"}
     settings = sfm.Settings(min_angle_rad=float(np.deg2rad(params.min_angle)), **options)
     reference, photos = inputs.reference, inputs.photos
+    tiling = sfm.Tiling(chunk_size=inputs.chunk_size or inputs.block.num_images, max_memory=max_memory)
     adjusted = sfm.adjust(
         inputs.block,
         inputs.tracks,
@@ -135,8 +140,10 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         settings,
         inputs.features or None,
         inputs.control,
+        tiling,
     )
-    sigmas = sfm.uncertainty(adjusted, reference)
+    room = {"max_memory": max_memory} if tiling.applies(inputs.block, inputs.tracks) else {}
+    sigmas = sfm.uncertainty(adjusted, reference, **room)
     controlled = sfm.apply_control(adjusted, sigmas, inputs.control, reference)
     block = controlled.block
     fit = sfm.gnss_fit(block, reference)

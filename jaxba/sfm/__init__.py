@@ -10,11 +10,11 @@ from jaxba.sfm._initialise import initialise
 from jaxba.sfm._intrinsics import AtBound, free_parameters, intrinsics_at_bounds
 from jaxba.sfm._points import with_points
 from jaxba.sfm._problem import to_problem
-from jaxba.sfm._rounds import Settings
+from jaxba.sfm._rounds import Settings, Tiling
 from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [
-    "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Uncertainty", "adjust", "agreeing_marks",
+    "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Tiling", "Uncertainty", "adjust", "agreeing_marks",
     "apply_affine", "apply_control", "control_findings", "control_part", "findings", "free_parameters", "gnss_fit",
     "height_above_ground", "initialise", "intrinsics_at_bounds", "place_by_control", "to_problem", "uncertainty",
     "with_offset", "with_points",

@@ -30,7 +30,7 @@ from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, withou
 from jaxba.sfm._intrinsics import free_parameters
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
 from jaxba.sfm._points import apply_points, triangulate_tracks
-from jaxba.sfm._rounds import Rounds, Settings, without_images
+from jaxba.sfm._rounds import Rounds, Settings, Tiling, without_images
 
 _log = logging.getLogger(__name__)
 
@@ -85,18 +85,26 @@ def adjust(
     settings: Settings,
     features: Mapping[int, Features] | None = None,
     control: Control | None = None,
+    tiling: Tiling | None = None,
 ) -> Adjusted:
     """Return the adjusted block; `block` holds the start values, with points or without.
 
     - `features`: of every image, by index, to complete tracks from; without them tracks stay as they are.
-    - `control`: surveyed points; its check points take no part.
+    - `control`: surveyed points; its check points take no part. `tiling`: of large blocks.
 
     Raises `JaxbaError` where the block has fewer than two images, or no point of it is left.
     """
     if block.num_images < 2:
         raise JaxbaError(f"The block has {block.num_images} images with start values; an adjustment needs two or more.")
     control = Control.nothing() if control is None else control
-    rounds = Rounds(anchor=block, reference=reference, photos=photos, settings=settings, control=control)
+    rounds = Rounds(
+        anchor=block,
+        reference=reference,
+        photos=photos,
+        settings=settings,
+        control=control,
+        tiling=Tiling() if tiling is None else tiling,
+    )
     if not block.num_points:
         limit = 4 * settings.track_threshold
         block = apply_points(block, tracks, triangulate_tracks(block, tracks, settings.min_angle_rad, limit))

@@ -1,15 +1,19 @@
-"""One round of the adjustment: the problem of a block with what was measured beside it, solved; all share one shape.
+"""One round of the adjustment: the problem of a block with what was measured beside it, solved.
 
-`Settings` are those of all rounds.
+`Settings` are those of all rounds. Rounds in one piece share one shape, so that the first compiles for all; a large
+block is solved in tiles, to the same answer, in as much memory as it is given (`Tiling`).
 """
 
 import dataclasses
+import logging
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba.ba import PlanShape, Problem, Solution, make_plan, reprojection_errors, solve
+from jaxba.ba import HistoryStep, PlanShape, Problem, Solution, make_plan, reprojection_errors, solve, solve_tiled
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
 from jaxba.scene import Block, Control, Photo, Reference, Tracks
 from jaxba.sfm._control import (
@@ -23,6 +27,8 @@ from jaxba.sfm._control import (
 )
 from jaxba.sfm._points import track_rows
 from jaxba.sfm._problem import to_problem, used_positions, with_solution
+
+_log = logging.getLogger(__name__)
 
 _SPARE = 0.03  # room for tracks that pruning cuts in two
 _LEAST_POSITIONS = 6
@@ -43,6 +49,23 @@ class Settings:
     min_angle_rad: float = 0.026
     max_rounds: int = 5
     complete_radius: float = 4.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tiling:
+    """When a block is solved in tiles, and in how much memory; it changes the answer by rounding alone.
+
+    - `chunk_size`: a block of more images is solved in tiles of at most so many. `max_observations`: so is one of more
+      observations. `max_memory`: that solving may take, as `solve_tiled` has it.
+    """
+
+    chunk_size: int = 500
+    max_observations: int = 1_000_000  # 2.1 GB in one piece, and slower there
+    max_memory: float | str | None = None
+
+    def applies(self, block: Block, tracks: Tracks) -> bool:
+        """Return whether the block is solved in tiles."""
+        return block.num_images > self.chunk_size or tracks.num_observations > self.max_observations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +91,7 @@ class Rounds:
     photos: Sequence[Photo]
     settings: Settings
     control: Control
+    tiling: Tiling
 
     def solve(
         self,
@@ -81,7 +105,7 @@ class Rounds:
         ftol: float,
         is_later: bool,
     ) -> Solved:
-        """Solve a block; `free` are the camera's parameters that may change, `shape` has the least sizes.
+        """Solve a block; `free` are the camera's parameters that may change, `shape` is of `shape`.
 
         - `mark_used`: of all marks of control. `is_later`: than the first round.
         """
@@ -111,15 +135,17 @@ class Rounds:
             )
 
         problem = problem_of(block, control)
-        plan = make_plan(problem, like=shape)
-        solution = solve(
-            problem,
-            loss=loss,
-            plan=plan,
-            max_nfev=max_nfev,
-            ftol=ftol,
-            xtol=settings.xtol,
-        )
+        stops: dict[str, Any] = {"max_nfev": max_nfev, "ftol": ftol, "xtol": settings.xtol}
+        if shape is None:
+            tiles: dict[str, Any] = {
+                "num_tiles": math.ceil(block.num_images / self.tiling.chunk_size),
+                "max_memory": self.tiling.max_memory,
+            }
+            solution = solve_tiled(problem, loss=loss, callback=_tell_step, **tiles, **stops)
+        else:
+            solution = solve(problem, loss=loss, plan=make_plan(problem, like=shape), **stops)
+        if solution.result == "interrupted":
+            raise KeyboardInterrupt  # the solver hands on what it reached; rounds go on from an optimum alone
         num_points, num_own = block.num_points, block.num_observations
         block = with_solution(block, solution)
         if control is not None:
@@ -136,8 +162,13 @@ class Rounds:
         error_px = error_px[: block.num_observations]
         return Solved(block, error_px, problem, loss, solution, scale, offset_m, control)
 
-    def shape(self, block: Block, tracks: Tracks) -> PlanShape:
-        """Return the shape of the block with every observation that may ever join it: all rounds share it."""
+    def shape(self, block: Block, tracks: Tracks) -> PlanShape | None:
+        """Return the shape of the block with every observation that may ever join it: all rounds share it.
+
+        None for a block that is solved in tiles.
+        """
+        if self.tiling.applies(block, tracks):
+            return None
         row, image_row, of_track, index = track_rows(block, tracks)
         full = dataclasses.replace(
             block,
@@ -151,6 +182,10 @@ class Rounds:
         control = control_part(block, self.control, np.ones(len(self.control.mark_point), bool))
         problem = to_problem(full, self.reference, self.photos, anchor=self.anchor, control=control)
         return make_plan(problem, spare=_SPARE).shape
+
+
+def _tell_step(step: HistoryStep) -> None:
+    _log.info("step %d, %.0f s", step.step, step.seconds)
 
 
 def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:

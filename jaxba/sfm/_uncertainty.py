@@ -61,8 +61,11 @@ class Uncertainty:
     covariance: Covariance | None = None
 
 
-def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
-    """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured."""
+def uncertainty(adjusted: Adjusted, reference: Reference, *, max_memory: float | str | None = None) -> Uncertainty:
+    """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured.
+
+    - `max_memory`: as in `covariance`.
+    """
     block = adjusted.block
     position, point = np.full((block.num_images, 3), np.nan), np.full((block.num_points, 3), np.nan)
     times = spread(adjusted)
@@ -73,7 +76,7 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     problem = dataclasses.replace(adjusted.problem, observations=observations)
     loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
-        found = covariance(problem, loss=loss)
+        found = covariance(problem, loss=loss, max_memory=max_memory)
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")

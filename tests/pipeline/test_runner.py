@@ -38,7 +38,7 @@ def quick(done: Done, monkeypatch: pytest.MonkeyPatch) -> None:
     def start_run(inputs: start.Inputs, params: start.Params) -> start.Outputs:
         return start.Outputs(block=dataclasses.replace(block, notes=(fingerprint(inputs, params),)))
 
-    def adjust_run(inputs: adjust.Inputs, params: adjust.Params) -> adjust.Outputs:
+    def adjust_run(inputs: adjust.Inputs, params: adjust.Params, max_memory: float) -> adjust.Outputs:
         mark = Finding.of("note", text=fingerprint(inputs, params))
         return dataclasses.replace(done.adjust, findings=(mark,))
 
@@ -118,6 +118,17 @@ def test_a_changed_parameter_reruns_its_stage_and_what_follows(made: Survey, tmp
     assert survey.run("match.ratio=0.7", "adjust.f_scale=2").stages_run == ("adjust", "export")
     # another parameter that changes no output stops there
     assert survey.run("match.ratio=0.7", "adjust.f_scale=2", "tracks.require_connected=true").stages_run == ("tracks",)
+
+
+def test_tiles_concern_the_adjustment_of_blocks_with_more_photos_alone(
+    made: Survey, done: Done, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # breaks where a small block is solved anew for tiles that it has not, or a large one without those asked for
+    survey = made.copy(tmp_path)
+    assert survey.run("tiles.chunk_size=200", "tiles.overlap=40", "workers.max_memory=3GB").stages_run == ()
+    assert PIPELINE["adjust"].inputs(done).chunk_size is None
+    monkeypatch.setitem(vars(done.settings["tiles"]), "chunk_size", NUM_PHOTOS - 1)
+    assert PIPELINE["adjust"].inputs(done).chunk_size == NUM_PHOTOS - 1
 
 
 def test_another_target_crs_reruns_crs_and_export_alone(made: Survey, tmp_path: Path):

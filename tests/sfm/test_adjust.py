@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -11,18 +11,19 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from simulated import Simulated, simulate, view_graph_of
 
-from jaxba import JaxbaError
+from jaxba import JaxbaError, solve_tiled
+from jaxba.ba import _descend
 from jaxba.scene import Block, Tracks
-from jaxba.sfm import Adjusted, Settings, Uncertainty, adjust, uncertainty
+from jaxba.sfm import Adjusted, Settings, Tiling, Uncertainty, _rounds, adjust, uncertainty
 from jaxba.sfm._edges import match_rows, without_edges
 
 WITHOUT = [3, 7]  # images without a position
 
 
-def _run(simulated: Simulated, **settings: object) -> Adjusted:
+def _run(simulated: Simulated, tiling: Tiling | None = None, **settings: object) -> Adjusted:
     return adjust(
         simulated.block, simulated.tracks, simulated.view_graph, simulated.reference, simulated.photos,
-        Settings(**settings),  # type: ignore[arg-type]
+        Settings(**settings), tiling=tiling,  # type: ignore[arg-type]
     )  # fmt: skip
 
 
@@ -148,6 +149,39 @@ def test_rounds_are_deterministic(clean: Simulated, adjusted_clean: Adjusted) ->
     again = _run(clean)
     for name in ("quaternion", "translation_m", "camera_parameters", "points_m", "observation_xy_px"):
         np.testing.assert_array_equal(getattr(again.block, name), getattr(adjusted_clean.block, name))
+
+
+IN_TILES = Tiling(chunk_size=5)
+
+
+def test_a_block_in_tiles_is_that_in_one_piece(
+    clean: Simulated, adjusted_clean: Adjusted, sigmas: Uncertainty, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # breaks where a tile loses an observation, a round ends elsewhere, or tiles are not asked for
+    solves = []
+    monkeypatch.setattr(
+        _rounds, "solve_tiled", lambda *a, **options: solves.append(options) or solve_tiled(*a, **options)
+    )
+    tiled = _run(clean, IN_TILES)
+    assert len(solves) >= len(tiled.medians_px) and {options["num_tiles"] for options in solves} == {3}
+    assert tiled.block.num_observations == adjusted_clean.block.num_observations
+    np.testing.assert_allclose(tiled.medians_px, adjusted_clean.medians_px, atol=1e-7)
+    np.testing.assert_allclose(tiled.block.centers_m, adjusted_clean.block.centers_m, atol=1e-6)
+    np.testing.assert_allclose(tiled.block.points_m, adjusted_clean.block.points_m, atol=1e-6)
+    of_tiles = uncertainty(tiled, clean.reference)
+    np.testing.assert_allclose(of_tiles.point_std_m, sigmas.point_std_m, atol=1e-6)
+    np.testing.assert_allclose(of_tiles.position_std_m, sigmas.position_std_m, atol=1e-6)
+
+
+@pytest.mark.parametrize("tiling", [None, IN_TILES], ids=["in one piece", "in tiles"])
+def test_ctrl_c_ends_the_rounds(clean: Simulated, tiling: Tiling | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    # breaks where a round goes on from what a solve had reached when it was interrupted
+    def press(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_descend, "_history_step", press)
+    with pytest.raises(KeyboardInterrupt):
+        _run(clean, tiling)
 
 
 def test_no_step_of_scipy_lowers_the_cost() -> None:

@@ -15,12 +15,12 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from jaxba.scene import Block, Photo, PrunedEdge, Tracks, ViewGraph
-from jaxba.sfm._points import Triangulated
+from jaxba.sfm._points import Triangulated, on_all_cores, pieces
 from jaxba.sfm._rays import Rays, make_rays
 
 _LEAST_MATCHES = 5  # fewer have no median to speak of
 _MAX_PRUNED = 0.3  # of the edges: more of them over the limit speak of the block, not of the edges
-_PIECE = 500_000  # matches worked on at a time
+_PIECE = 100_000  # matches worked on at a time by a core
 _FAR = 10.0  # times the limit of an edge: no bent block explains it
 
 
@@ -69,11 +69,13 @@ def edge_medians_px(
     both = (first >= 0) & (second >= 0)
     edge, first, second = matches.edge[both], first[both], second[both]
     error = np.zeros(len(edge))
-    for start in range(0, len(edge), _PIECE):
-        here = slice(start, start + _PIECE)
+
+    def of_piece(_: slice, here: slice) -> None:
         rows, (one, other) = np.unique((first[here], second[here]), return_inverse=True)
         rays = make_rays(block, found.image_row[rows], tracks.xy_px[found.row[rows]])
         error[here] = epipolar_px(rays.take(one), rays.take(other))
+
+    on_all_cores(of_piece, pieces(np.bincount(edge, minlength=num_edges), _PIECE))
     for side in (first, second):
         of_point = np.where(found.is_point[found.of_track[side]], found.error_px[side], 0.0)
         error = np.fmax(error, of_point)

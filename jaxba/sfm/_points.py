@@ -18,7 +18,9 @@ are wrong.
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -29,7 +31,7 @@ from jaxba.sfm._rays import Rays, make_rays
 
 _MAX_PAIRS = 45  # of one track's rays: all of them up to ten rays
 _CONSENSUS_SIZE = 1_000_000  # errors computed at a time
-_PIECE = 500_000  # rows worked on at a time: some 0.6 kB each
+_PIECE = 100_000  # rows worked on at a time by a core: some 0.6 kB each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,11 +117,13 @@ def triangulate_tracks(
         limit_px /= redundancy_root(counts)[of_track]
     point, error = np.zeros((3, len(counts))), np.zeros(len(row))
     is_used, is_point = np.zeros(len(row), bool), np.zeros(len(counts), bool)
-    for piece, rows in pieces(counts, _PIECE):
+
+    def triangulate(piece: slice, rows: slice) -> None:
         rays = make_rays(block, image_row[rows], tracks.xy_px[row[rows]])
-        problem = _Tracks.of(rays, counts[piece], middle_m, limit_px[rows])
-        found = problem.triangulated(min_angle_rad)
+        found = _Tracks.of(rays, counts[piece], middle_m, limit_px[rows]).triangulated(min_angle_rad)
         point[:, piece], error[rows], is_used[rows], is_point[piece] = found
+
+    on_all_cores(triangulate, pieces(counts, _PIECE))
     return Triangulated(row, image_row, of_track, track_index, point.T.copy(), error, is_used, is_point)
 
 
@@ -135,6 +139,16 @@ def pieces(counts: Int[np.ndarray, " groups"], most: int) -> Iterator[tuple[slic
         last = max(int(np.searchsorted(ends, first_row + most, side="right")), first + 1)
         yield slice(first, last), slice(first_row, int(ends[last - 1]))
         first, first_row = last, int(ends[last - 1])
+
+
+def on_all_cores(work: Callable[[slice, slice], None], of_pieces: Iterable[tuple[slice, slice]]) -> None:
+    """Call `work` with each piece, whose results go to places of their own: numpy holds no lock while it computes."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            list(pool.map(work, *zip(*of_pieces, strict=True)))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def redundancy_root(views: Int[np.ndarray, " tracks"]) -> Float[np.ndarray, " tracks"]:

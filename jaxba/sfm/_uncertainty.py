@@ -35,11 +35,11 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import Covariance, covariance
 from jaxba.scene import Block, Reference
 from jaxba.sfm._adjust import Adjusted
-from jaxba.sfm._points import pieces, redundancy_root
+from jaxba.sfm._points import on_all_cores, pieces, redundancy_root
 from jaxba.sfm._problem import used_positions
 from jaxba.sfm._rays import make_rays
 
-_PIECE = 500_000  # observations worked on at a time
+_PIECE = 100_000  # observations worked on at a time by a core
 _LEAST_REDUNDANCY = 30  # to tell how errors are spread
 _LEAST_TRACKS, _LEAST_FREEDOM = 100, 3  # to tell how variances are distributed
 _FREEDOM = np.geomspace(3.0, 1000.0, 400)  # of that distribution; at the last, all tracks are alike
@@ -142,7 +142,8 @@ def own_variance(block: Block, std_px: float) -> Float[np.ndarray, "points 3"]:
     order = np.argsort(block.observation_point, kind="stable")
     variance = np.zeros((block.num_points, 3))
     counts = np.bincount(block.observation_point, minlength=block.num_points)
-    for points, rows in pieces(counts, _PIECE):
+
+    def of_piece(points: slice, rows: slice) -> None:
         seen = order[rows]
         rays = make_rays(block, block.observation_image[seen], block.observation_xy_px[seen])
         distance = rays.errors_px(block.points_m[block.observation_point[seen]].T)[1]
@@ -152,6 +153,8 @@ def own_variance(block: Block, std_px: float) -> Float[np.ndarray, "points 3"]:
         normal[~np.isfinite(normal).all(axis=(1, 2))] = 0.0
         inverse = np.linalg.pinv(normal, hermitian=True)
         variance[points] = np.maximum(np.einsum("nii->ni", inverse), 0.0)
+
+    on_all_cores(of_piece, pieces(counts, _PIECE))
     return variance
 
 

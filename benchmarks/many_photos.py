@@ -16,8 +16,9 @@ import numpy as np
 import psutil
 
 from jaxba.engine import Resources
+from jaxba.engine._engines import work
+from jaxba.engine._items import Item
 from jaxba.engine._key import Key
-from jaxba.engine._pool import Item, work
 from jaxba.engine._store import Stored, load, save
 from jaxba.engine._work import run_one
 from jaxba.pipeline import PIPELINE, features, match

@@ -122,6 +122,14 @@ class WorkerOptions:
         Parameter(help="What features may take on the disk: a share of what is free, or an amount. [default: 0.9]"),
     ] = None
 
+    scheduler: Annotated[
+        str | None,
+        Parameter(help="Address of a dask scheduler, tcp://host:8786: its workers do features and matches."),
+    ] = None
+    scheduler_file: Annotated[
+        str | None, Parameter(help="The same, by the file that the scheduler wrote for its workers.")
+    ] = None
+
     def changes(self) -> list[str]:
         """Return what was given as changes of settings."""
         given = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}

@@ -44,6 +44,11 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def holder_file(folder: Path) -> Path:
+    """Return the file in a locked project that no other project has alike."""
+    return folder.absolute() / _HOLDER
+
+
 def holder(folder: Path) -> str | None:
     """Return who works on a project, in words; None where nobody does."""
     if not (folder / _NAME).exists():

@@ -1,9 +1,8 @@
 """Work on many photos in processes: one that dies or hangs costs the photo that it worked on, and nothing else.
 
 Each worker uses one thread of OpenCV and of BLAS, and may not grow over its share of the memory; how many there are
-follows from the machine's cores and from what the largest photo needs. A photo whose worker died, or had not memory
-enough, is tried once more when the others are done, by one worker alone: what the machine lacked is there then, and
-who was only in the way of another is no victim. Workers end with the run, also when it is killed.
+follows from the machine's cores and from what the largest photo needs. Workers end with the run, also when it is
+killed.
 """
 
 import contextlib
@@ -14,97 +13,47 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import psutil
 from pebble import ProcessExpired, ProcessPool
 
 from jaxba._errors import JaxbaError
+from jaxba.engine._items import Ended, Item, called, died, late
 from jaxba.engine._workers import Resources
-from jaxba.scene import fault, lacks_memory
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 _AHEAD = 2  # items given out a worker, so that none waits for its next one
 _MOST_BROKEN = 3  # pools in a row that break before an item ended
 _LOOK_S = 0.5
 _STUCK_S = 180.0  # beyond the time limit: a worker was killed as it held the lock on the others
-_TOO_LARGE, _NO_MEMORY, _DIED = "needs about", "not enough memory", "its worker process"  # reasons begin with them
 _DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux
 
 
-@dataclass(frozen=True, kw_only=True)
-class Item:
-    """One photo's work: `call(*arguments)` in a worker.
+class LocalWorkers:
+    """The engine of this machine: worker processes, as many as its cores and its memory allow for these items."""
 
-    - `name`: the photo's. `need_bytes`: the memory it takes. `effort`: how long it takes, against other items: its
-      megapixels, times the photos it is worked on with.
-    """
+    def __init__(self, items: Sequence[Item], resources: Resources) -> None:
+        self.resources, self.memory_bytes = resources, resources.memory_bytes
+        needs = [item.need_bytes for item in items if item.need_bytes <= self.memory_bytes]
+        self.num_fitting, self.largest_bytes = len(needs), max(needs, default=0.0)
+        self.count = min(resources.num_workers(self.largest_bytes), len(needs)) if needs else 0
 
-    name: str
-    arguments: tuple[Any, ...]
-    need_bytes: float
-    effort: float = 1.0
-
-
-@dataclass(frozen=True)
-class _Ended:
-    """How a call ended: `result`, or `reason` why there is none. `error`: of the run itself, which stops it."""
-
-    how: Literal["done", "failed", "error", "memory", "died", "late"]
-    result: Any = None
-    reason: str | None = None
-
-
-def work(
-    call: Callable[..., Any], items: Sequence[Item], resources: Resources
-) -> Generator[tuple[Item, Any, str | None], None, None]:
-    """Yield each item with its result, or with the reason why it has none, as they come to an end.
-
-    `call` must be a module's function. A `JaxbaError` in it is raised here: it stops the run.
-    """
-    for item in items:
-        if item.need_bytes > resources.memory_bytes:
-            need, allowed = _gb(item.need_bytes), _gb(resources.memory_bytes)
-            yield item, None, f"{_TOO_LARGE} {need} of memory, {allowed} are allowed; raise --max-memory"
-    fitting, count, _ = _crew(items, resources)
-    again: list[tuple[Item, _Ended]] = []
-    for item, ended in _worked(call, fitting, resources, count):
-        if ended.how == "died" or (ended.how == "memory" and count > 1):
-            again.append((item, ended))
-        else:
-            yield item, ended.result, _reason(ended)
-    for item, ended in _worked(call, [item for item, _ in again], resources, 1):
-        yield item, ended.result, _reason(ended, " twice, the second time with no other beside it")
-
-
-def fewer_workers(items: Sequence[Item], resources: Resources) -> str | None:
-    """Return in words that the memory allows fewer workers than are asked for; None where it does not limit them."""
-    fitting, count, largest = _crew(items, resources)
-    wanted = min(resources.num_wanted(), len(fitting))
-    if count >= wanted:
-        return None
-    return (
-        f"{count} of {wanted} workers: a photo needs up to {_gb(largest)} of memory, "
-        f"{_gb(resources.memory_bytes)} are allowed for all; --max-memory raises it."
-    )
-
-
-def _crew(items: Sequence[Item], resources: Resources) -> tuple[list[Item], int, float]:
-    """Return the items that fit into the memory, how many workers there are for them, and what the largest needs."""
-    fitting = [item for item in items if item.need_bytes <= resources.memory_bytes]
-    largest = max((item.need_bytes for item in fitting), default=0.0)
-    return fitting, min(resources.num_workers(largest), len(fitting)) if fitting else 0, largest
+    def worked(
+        self, call: Callable[..., Any], items: Sequence[Item], *, alone: bool = False
+    ) -> Iterator[tuple[Item, Ended]]:
+        """Yield how each item ended, as they do."""
+        return _worked(call, items, self.resources, 1 if alone else self.count)
 
 
 def _worked(
     call: Callable[..., Any], items: Sequence[Item], resources: Resources, count: int
-) -> Iterator[tuple[Item, _Ended]]:
+) -> Iterator[tuple[Item, Ended]]:
     """Yield how each item ended, as they do.
 
     A pool breaks, or no longer moves, when a worker is killed between two items. Items that it had not ended are given
@@ -128,7 +77,7 @@ def _worked(
                     item = waiting.popleft()
                     seconds = resources.seconds_for(item.effort)
                     try:
-                        future = pool.schedule(_called, args=(call, item.arguments), timeout=seconds)
+                        future = pool.schedule(called, args=(call, item.arguments), timeout=seconds)
                     except RuntimeError:  # it has just broken
                         waiting.appendleft(item)
                         break
@@ -144,48 +93,16 @@ def _worked(
         waiting.extendleft(reversed(given.values()))
 
 
-def _ended(future: Future, seconds: float) -> _Ended:
+def _ended(future: Future, seconds: float) -> Ended:
     try:
-        ended: _Ended = future.result()
+        ended: Ended = future.result()
     except TimeoutError:  # of the pool: what the call raises comes as a result
-        return _Ended("late", None, f"took longer than {seconds:g} s; raise --time-limit, or look at the file")
+        return late(seconds)
     except ProcessExpired as error:
-        code = error.exitcode
-        by_signal = code is not None and code < 0
-        return _Ended("died", None, f"was killed by {_signal(-code)}" if by_signal else f"ended with exit code {code}")
+        return died(error.exitcode)
     if ended.how == "error":
         raise JaxbaError(ended.reason)
     return ended
-
-
-def _reason(ended: _Ended, how_often: str = "") -> str | None:
-    if ended.how == "died":
-        return f"{_DIED} {ended.reason}{how_often}: out of memory, or a broken file that crashes the decoder"
-    if ended.how == "memory":
-        return f"{_NO_MEMORY}; raise --max-memory, or close other programs"
-    return ended.reason
-
-
-def lacked_memory(reason: str) -> bool:
-    """Whether an item has no result for want of memory: the system kills, and C++ aborts, where there is none."""
-    killed = reason.startswith(_DIED) and any(name in reason for name in ("SIGKILL", "SIGABRT"))
-    return killed or reason.startswith((_TOO_LARGE, _NO_MEMORY))
-
-
-def crashed(reason: str) -> bool:
-    """Whether an item has no result since its worker died of something else than memory."""
-    return reason.startswith(_DIED) and not lacked_memory(reason)
-
-
-def _signal(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
-
-
-def _gb(count: float) -> str:
-    return f"{count / 1e9:.1f} GB"
 
 
 @contextlib.contextmanager
@@ -222,18 +139,6 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-
-
-def _called(call: Callable[..., Any], arguments: tuple[Any, ...]) -> _Ended:
-    """Call in a worker. What it raises is put in words here, since not every exception survives the way back."""
-    try:
-        return _Ended("done", call(*arguments))
-    except JaxbaError as error:
-        return _Ended("error", None, str(error))
-    except BaseException as error:  # whatever a decoder makes of a broken file, it costs that file alone
-        if lacks_memory(error):
-            return _Ended("memory")
-        return _Ended("failed", None, f"was stopped {fault(error)}")
 
 
 def _prepare_worker(limit_bytes: int, call: Callable[..., Any]) -> None:

@@ -78,7 +78,7 @@ class Project:
 
     def stage(self, name: str, photo: str | None = None) -> Path:
         """Return the folder of what a stage made, or made of one photo."""
-        folder = self.folder / "stages" / name
+        folder = self.folder.absolute() / "stages" / name  # which holds wherever it is worked on
         return folder if photo is None else folder / _folder_name(photo)
 
     def remove_if_new(self) -> None:

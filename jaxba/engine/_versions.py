@@ -21,7 +21,17 @@ _COMPUTE = {
 }
 """Distributions that a package may come from, by the name under which it is imported."""
 
-COMPUTE_NOTHING = {"cattrs", "defusedxml", "filelock", "jaxtyping", "lazy_loader", "pebble", "psutil", "threadpoolctl"}
+COMPUTE_NOTHING = {
+    "cattrs",
+    "defusedxml",
+    "distributed",
+    "filelock",
+    "jaxtyping",
+    "lazy_loader",
+    "pebble",
+    "psutil",
+    "threadpoolctl",
+}
 """Packages that are imported and leave no mark on a result: they check, store and supervise."""
 
 
@@ -35,6 +45,11 @@ def versions_of(packages: frozenset[str]) -> dict[str, str]:
     """
     names = [name for package in sorted(packages) for name in _COMPUTE.get(package, ())]
     return {name: version for name in names if (version := _version(name)) is not None}
+
+
+def installed() -> dict[str, str]:
+    """Return the installed version of each distribution that computes."""
+    return versions_of(frozenset(_COMPUTE))
 
 
 @functools.cache

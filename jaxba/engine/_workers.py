@@ -32,12 +32,24 @@ class Resources(Parameters):
         0.9, help="what features may take on the disk: a share of what is free, 0.1 to 1, or an amount such as 500GB"
     )
 
+    scheduler: str | None = parameter(
+        None, help="a dask cluster in place of this machine's processes: its scheduler's address, tcp://host:8786"
+    )
+    scheduler_file: str | None = parameter(None, help="the same, by the file that the scheduler wrote for its workers")
+
     def __post_init__(self) -> None:
         Parameters.__post_init__(self)
+        if self.scheduler is not None and self.scheduler_file is not None:
+            raise JaxbaError("workers.scheduler and workers.scheduler_file: give one of the two.")
         _check_amount("max_memory", self.max_memory, most_share=0.95, least_bytes=_LEAST_MEMORY)
         _check_amount("max_store", self.max_store, most_share=1.0, least_bytes=_LEAST_STORE)
         if self.max_failed > 1 and not float(self.max_failed).is_integer():
             raise JaxbaError(f"workers.max_failed={self.max_failed:g}: give a share below 1, or a whole number.")
+
+    @property
+    def is_cluster(self) -> bool:
+        """Whether a dask cluster does the work."""
+        return self.scheduler is not None or self.scheduler_file is not None
 
     @property
     def memory_bytes(self) -> float:

@@ -17,10 +17,11 @@ from typing import Any
 from jaxba._atomic import write_folder_atomically
 from jaxba._errors import JaxbaError
 from jaxba.engine import _store
+from jaxba.engine._engines import fewer_workers, work as work_on
+from jaxba.engine._items import Item
 from jaxba.engine._limits import check_failures
-from jaxba.engine._lock import locked
+from jaxba.engine._lock import holder_file, locked
 from jaxba.engine._parameters import Parameters
-from jaxba.engine._pool import Item, fewer_workers, work as work_on
 from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists, refuse_photo_folder
 from jaxba.engine._settings import Settings, to_toml
 from jaxba.engine._stage import Stage, left_out
@@ -135,7 +136,8 @@ def _run_stage(
         return collected(stage, done, items)[0], len(waiting), (), ()
     if waiting:
         stage.refuse(project.stage(stage.name), items, params, resources)
-    failed, notes = _run_photos(stage, items, waiting, params, resources, tell)
+    reads = holder_file(project.folder), *{file.path.parent: file.path for file in done.files}.values()
+    failed, notes = _run_photos(stage, items, waiting, params, resources, reads, tell)
     by_name = {left.name: left for left in (*failed, *failures(items))}
     unused = tuple(by_name[name] for name in sorted(by_name))
     check_failures(stage.name, unused, len(items), resources)
@@ -161,9 +163,13 @@ def _run_photos(
     waiting: list[Work],
     params: Parameters,
     resources: Resources,
+    reads: tuple[Path, ...],
     tell: Callable[[Event], None],
 ) -> tuple[list[LeftOut], tuple[str, ...]]:
-    """Run a stage for its photos that wait, in workers; return those that failed, with the reason, and notes."""
+    """Run a stage for its photos that wait, in workers; return those that failed, with the reason, and notes.
+
+    - `reads`: files that tell whether a worker sees the project and the photos.
+    """
     if not waiting:
         return [], ()
     module, todo = stage.module.__name__, {id(work) for work in waiting}
@@ -175,6 +181,7 @@ def _run_photos(
             arguments=(module, work.folder, work.inputs, params, work.key),
             need_bytes=memory_for(work.megapixels),
             effort=work.megapixels * (1 + work.partners),
+            reads=reads,
         )
         for work in waiting
     ]

@@ -12,7 +12,8 @@ from worker_calls import double, double_slowly, hold, killed_once, killed_with_t
 
 from jaxba import JaxbaError
 from jaxba.engine import Resources, _pool
-from jaxba.engine._pool import Item, fewer_workers, work
+from jaxba.engine._engines import fewer_workers, work
+from jaxba.engine._items import Item, crashed, lacked_memory
 
 
 def items(*numbers: int, need_bytes: float = 1e8) -> list[Item]:
@@ -51,8 +52,8 @@ def test_what_goes_wrong_with_an_item_costs_that_item_alone_and_is_named():
         assert f"was stopped by a fault of jaxba and not of the input ({words}" in reasons[name]
         assert "please report it" in reasons[name]
     assert "SIGSEGV" in reasons["20"]
-    assert {name for name, reason in reasons.items() if reason and _pool.lacked_memory(reason)} == {"13"}
-    assert {name for name, reason in reasons.items() if reason and _pool.crashed(reason)} == {"14", "20"}
+    assert {name for name, reason in reasons.items() if reason and lacked_memory(reason)} == {"13"}
+    assert {name for name, reason in reasons.items() if reason and crashed(reason)} == {"14", "20"}
     assert reasons["21"] == "took longer than 2 s; raise --time-limit, or look at the file"
 
 
@@ -153,7 +154,8 @@ import sys
 sys.path.append({folder!r})
 from worker_calls import double
 from jaxba.engine import Resources
-from jaxba.engine._pool import Item, work
+from jaxba.engine._engines import work
+from jaxba.engine._items import Item
 if __name__ == "__main__":
     print("begun", flush=True)
     list(work(double, [Item(name=str(n), arguments=(21,), need_bytes=1e8) for n in range(2)], Resources(workers=2)))

@@ -1,7 +1,7 @@
 """Rules on limits: a run that was killed, photos that need more memory than is allowed, features that do not fit."""
 
 from jaxba._sizes import bytes_of, machine_memory, size_text
-from jaxba.engine import _pool
+from jaxba.engine import _items
 from jaxba.engine._words import some
 from jaxba.engine._workers import Resources, memory_for
 from jaxba.report._recorded import Recorded
@@ -49,7 +49,7 @@ def over_memory(case: Recorded) -> Diagnosis | None:
     allowed = resources.memory_bytes
     need = {photo.name: memory_for(photo.megapixels) for photo in case.done.photos}
     over = [name for name, count in need.items() if count > allowed]
-    lost = [left for left in _failed(case) if _pool.lacked_memory(left.reason) and left.name not in over]
+    lost = [left for left in _failed(case) if _items.lacked_memory(left.reason) and left.name not in over]
     names = [*over, *(left.name for left in lost)]
     if not names:
         return None
@@ -78,7 +78,7 @@ def over_memory(case: Recorded) -> Diagnosis | None:
 
 def crashed(case: Recorded) -> Diagnosis | None:
     """Photos whose worker died of something else than memory: a broken file that crashes the decoder."""
-    lost = [left for left in _failed(case) if _pool.crashed(left.reason)]
+    lost = [left for left in _failed(case) if _items.crashed(left.reason)]
     if not lost:
         return None
     names = [left.name for left in lost]

@@ -1,0 +1,266 @@
+"""The engine of a dask cluster: workers that someone else has started, on machines that see the project's folder.
+
+A worker is given as many items as it has threads, the next one when one has ended: so it is known when each began. One
+that takes too long is ended with its worker's process, which the worker's nanny starts anew; a worker that is lost
+costs no other item than those it had. Before a worker is given anything it is asked for its versions and for what it
+sees of the project: another OpenCV would record other features under the same key.
+
+What is encrypted, and by which certificates, dask's own settings say (`distributed.comm.tls`).
+"""
+
+import contextlib
+import functools
+import hashlib
+import json
+import logging
+import platform
+import queue
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxba import __version__
+from jaxba._errors import JaxbaError
+from jaxba.engine._items import Ended, Item, called, late
+from jaxba.engine._versions import installed
+from jaxba.engine._workers import Resources
+
+try:
+    import distributed
+except ImportError as error:
+    raise JaxbaError(f"a dask cluster needs the extra: pip install 'jaxba[cluster]' ({error}).") from error
+
+_ANSWER_S = 10.0  # for a scheduler to answer
+_PATIENCE_S = 60.0  # for workers to be there
+_LOOK_S = 0.5
+_HEAD = 65536  # bytes of a file that tell it from others
+
+
+class _Given(NamedTuple):
+    """An item that a worker works on: since when, and how long it may take."""
+
+    item: Item
+    address: str
+    begun_s: float
+    seconds: float
+
+
+@contextlib.contextmanager
+def cluster(items: Sequence[Item], resources: Resources) -> Iterator["Cluster"]:
+    """Yield the engine; raise `JaxbaError` where the cluster is not there, or not fit for these items."""
+    logger = logging.getLogger("distributed")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)  # what goes wrong is said here, once
+    client = None
+    try:
+        client = _client(resources)
+        yield Cluster(client, items, resources)
+    finally:
+        if client is not None:
+            client.close()
+        logger.setLevel(level)
+
+
+class Cluster:
+    """The workers of a client's cluster.
+
+    - `count`: threads of all workers. `memory_bytes`: that the largest worker allows its process.
+    """
+
+    def __init__(self, client: distributed.Client, items: Sequence[Item], resources: Resources) -> None:
+        self._client, self._resources = client, resources
+        self._reads = sorted({path for item in items for path in item.reads})
+        self._alike: set[str] = set()
+        self._stuck: set[str] = set()
+        self._ending: queue.SimpleQueue[distributed.Future] = queue.SimpleQueue()
+        workers = self._workers()
+        self.count = sum(worker["nthreads"] for worker in workers.values())
+        self.memory_bytes = max(worker["memory_limit"] or float("inf") for worker in workers.values())
+
+    def worked(
+        self, call: Callable[..., Any], items: Sequence[Item], *, alone: bool = False
+    ) -> Iterator[tuple[Item, Ended]]:
+        """Yield how each item ended, as they do."""
+        waiting, given = deque(items), dict[distributed.Future, _Given]()
+        try:
+            while waiting or given:
+                workers = self._workers()
+                for future, one in list(given.items()):
+                    if (ended := self._given_up(one, workers)) is not None:
+                        self._client.cancel([future])
+                        del given[future]
+                        yield one.item, ended
+                for address in _free(workers, given.values(), alone=alone)[: len(waiting)]:
+                    item = waiting.popleft()
+                    future = self._client.submit(called, call, item.arguments, workers=[address], pure=False, retries=0)
+                    future.add_done_callback(self._ending.put)
+                    given[future] = _Given(item, address, time.monotonic(), self._resources.seconds_for(item.effort))
+                for future in self._done(given):
+                    one = given.pop(future)
+                    yield one.item, _ended(future, one)
+        finally:
+            with contextlib.suppress(Exception):  # a client that has lost its scheduler cannot
+                self._client.cancel(list(given))
+
+    def _done(self, given: dict[distributed.Future, _Given]) -> list[distributed.Future]:
+        """Return those that have ended, after a while where none has."""
+        done = []
+        with contextlib.suppress(queue.Empty):
+            done.append(self._ending.get(timeout=_LOOK_S))
+            while True:
+                done.append(self._ending.get_nowait())
+        return [future for future in done if future in given and future.status in ("finished", "error")]
+
+    def _given_up(self, one: _Given, workers: dict[str, Any]) -> Ended | None:
+        """Return how an item has ended that will not end by itself; None for the others."""
+        if one.address not in workers:
+            return Ended("died", None, f"{one.address} was lost")
+        if time.monotonic() - one.begun_s <= one.seconds:
+            return None
+        try:
+            self._client.restart_workers([one.address], timeout=_PATIENCE_S, raise_for_error=False)
+        except ValueError:  # it has no nanny: its thread works on, and gets nothing any more
+            self._stuck.add(one.address)
+        return late(one.seconds)
+
+    def _workers(self) -> dict[str, Any]:
+        """Return what the scheduler says of the workers that may be given items, by address; wait where there is none.
+
+        Raises `JaxbaError` where none comes, or the scheduler has gone, or a worker is unlike this process.
+        """
+        begun_s = time.monotonic()
+        while True:
+            try:
+                found = dict(self._client.scheduler_info(n_workers=-1)["workers"])
+            except (OSError, TimeoutError, RuntimeError, KeyError) as error:  # what it says of itself is empty then
+                raise JaxbaError(
+                    f"{self._where}: the scheduler no longer answers. What is done is kept; start it again with its "
+                    "workers, and the same command goes on."
+                ) from error
+            workers = {address: found[address] for address in sorted(found) if address not in self._stuck}
+            if new := [address for address in workers if address not in self._alike]:
+                self._require_alike(new)
+                self._alike.update(new)
+            if workers:
+                return workers
+            if time.monotonic() - begun_s > _PATIENCE_S:
+                raise JaxbaError(
+                    f"{self._where}: the scheduler has no worker to give anything to. What is done is kept; start "
+                    "workers (dask worker with the same address or scheduler file), and the same command goes on."
+                )
+            time.sleep(_LOOK_S)
+
+    @property
+    def _where(self) -> str:
+        return _where(self._resources)
+
+    def _require_alike(self, addresses: list[str]) -> None:
+        """Raise `JaxbaError` for a worker of other versions, or one that does not see the project as this process."""
+        here = _about([str(path.absolute()) for path in self._reads])
+        found: Any = self._client.run(_about, list(here.seen), workers=addresses, on_error="return")
+        for address, there in sorted(found.items()):
+            if isinstance(there, OSError):  # it has just gone
+                continue
+            if not isinstance(there, _About):
+                raise JaxbaError(
+                    f"worker {address}: jaxba cannot be used there ({type(there).__name__}: {there}). Install the same "
+                    "environment on all machines."
+                )
+            for name in sorted(here.versions.keys() | there.versions.keys()):
+                own, other = here.versions.get(name, "none"), there.versions.get(name, "none")
+                if own != other:
+                    raise JaxbaError(
+                        f"worker {address} on {there.host}: it has {name} {other}, and this process has {own}; results "
+                        "would differ by the worker. Install the same versions on all machines (requirements.lock)."
+                    )
+            for path, content in here.seen.items():
+                if there.seen[path] != content:
+                    raise JaxbaError(
+                        f"worker {address} on {there.host} does not see {path} as this machine does. Photos and "
+                        "project have to lie on storage that all machines mount under the same path."
+                    )
+
+
+class _About(NamedTuple):
+    """What is compared of a worker: its versions, and its files' first bytes, None for what it does not see."""
+
+    host: str
+    versions: dict[str, str]
+    seen: dict[str, str | None]
+
+
+def _about(paths: list[str]) -> _About:
+    return _About(
+        platform.node(), {**installed(), "Python": platform.python_version(), "jaxba": _source()}, _seen(paths)
+    )
+
+
+@functools.cache
+def _source() -> str:
+    """Return jaxba's version, with a mark of its source: two checkouts of a version differ."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    return f"{__version__} (source {digest.hexdigest()[:8]})"
+
+
+def _seen(paths: list[str]) -> dict[str, str | None]:
+    found: dict[str, str | None] = {}
+    for path in paths:
+        try:
+            with open(path, "rb") as file:
+                found[path] = hashlib.sha256(file.read(_HEAD)).hexdigest()
+        except OSError:
+            found[path] = None
+    return found
+
+
+def _free(workers: dict[str, Any], given: Any, *, alone: bool) -> list[str]:
+    """Return the address of each thread that nothing was given to; of one, where no other item is worked on."""
+    busy = [one.address for one in given]
+    if alone:
+        return [] if busy else list(workers)[:1]
+    return [address for address, worker in workers.items() for _ in range(worker["nthreads"] - busy.count(address))]
+
+
+def _ended(future: distributed.Future, one: _Given) -> Ended:
+    if future.status == "error":
+        error = future.exception()
+        if isinstance(error, distributed.KilledWorker):
+            return Ended("died", None, f"{one.address} was lost")
+        raise JaxbaError(f"worker {one.address}: {type(error).__name__}: {error}")
+    ended: Ended = future.result()
+    if ended.how == "error":
+        raise JaxbaError(f"{ended.reason} (on the worker {one.address})")
+    return ended
+
+
+def _client(resources: Resources) -> distributed.Client:
+    """Return a client of the scheduler that the settings name; raise `JaxbaError` where there is none."""
+    where = _where(resources)
+    if resources.scheduler_file is not None:
+        try:
+            address = json.loads(Path(resources.scheduler_file).read_text(encoding="utf-8"))["address"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise JaxbaError(
+                f"{where}: no file of a dask scheduler ({error}). Start one with dask scheduler --scheduler-file "
+                f"{resources.scheduler_file}, and its workers with the same option."
+            ) from error
+    else:
+        address = resources.scheduler
+    try:
+        return distributed.Client(address, timeout=_ANSWER_S, set_as_default=False, name="jaxba")
+    except (OSError, TimeoutError, ValueError, RuntimeError) as error:
+        raise JaxbaError(
+            f"{where}: no scheduler answers at {address} in {_ANSWER_S:g} s. Start one with dask scheduler, or "
+            "correct the address (tcp://host:8786; tls:// where it is encrypted)."
+        ) from error
+
+
+def _where(resources: Resources) -> str:
+    if resources.scheduler_file is not None:
+        return f"workers.scheduler_file={resources.scheduler_file}"
+    return f"workers.scheduler={resources.scheduler}"

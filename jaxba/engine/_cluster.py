@@ -251,6 +251,11 @@ def _client(resources: Resources) -> distributed.Client:
             ) from error
     else:
         address = resources.scheduler
+    if str(address).startswith("tls:") and not distributed.Security().get_connection_args("client").get("ssl_context"):
+        raise JaxbaError(
+            f"{where}: dask's settings name no certificates for {address}. Set DASK_DISTRIBUTED__COMM__TLS__CA_FILE, "
+            "..__TLS__CLIENT__CERT and ..__TLS__CLIENT__KEY."
+        )
     try:
         return distributed.Client(address, timeout=_ANSWER_S, set_as_default=False, name="jaxba")
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:

@@ -134,6 +134,8 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pyt
     absent = tmp_path / "absent.json"
     with pytest.raises(JaxbaError, match=r"absent\.json: no file of a dask scheduler \(.*No such file"):
         list(work(double, items(1), Resources(scheduler_file=str(absent))))
+    with pytest.raises(JaxbaError, match=r"no certificates for tls://a:1\. Set DASK_DISTRIBUTED__COMM__TLS__CA_FILE"):
+        list(work(double, items(1), Resources(scheduler="tls://a:1")))
     with pytest.raises(JaxbaError, match="give one of the two"):
         Resources(scheduler="tcp://a:1", scheduler_file="b")
 

@@ -9,12 +9,14 @@ A found feature's descriptor must be as near to one of the track's as the featur
 the limit is the 90% quantile of their distances. Whether the found observations fit is for the adjustment to judge,
 like that of all others.
 
-Cost: a projection and a search in a k-d tree for each point and image, one image's features at a time; 40 images with
-20,000 points take 4 s.
+Cost: a turn for each point and image, 10 ns, and a projection and a search in a k-d tree for each point that an image
+looks towards; the features of as many images as there are cores are open at a time.
 """
 
 import dataclasses
+import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,9 +28,11 @@ from scipy.spatial.transform import Rotation
 from jaxba.ba import project_in_cameras
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Features, Photo, Tracks
+from jaxba.sfm._rays import make_rays
 
 _NEAREST = 4  # features that compete for a point
 _QUANTILE = 0.9
+_BORDER, _MARGIN = 17, 1.05  # pixels on each side of an image; of the angle to them
 _LEAST_PAIRS = 50  # of matched features, to know how near they are
 
 
@@ -54,7 +58,17 @@ def complete_tracks(
     known = _Known.of(block, tracks, features)
     if known is None:
         return tracks
-    links = [_links_in(row, block, tracks, features, photos, known, radius_px) for row in range(block.num_images)]
+    cos_view = _cos_of_view(block, photos)
+
+    def links_in(row: int) -> _Links:
+        return _links_in(row, block, tracks, features, photos, known, radius_px, cos_view[block.camera_index[row]])
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            links = list(pool.map(links_in, range(block.num_images)))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     columns = [np.concatenate([getattr(part, name) for part in links]) for name in _Links.__dataclass_fields__]
     return _joined(tracks, _Links(*columns))
 
@@ -104,6 +118,7 @@ def _links_in(
     photos: tuple[Photo, ...],
     known: _Known,
     radius_px: float,
+    cos_view: float,
 ) -> _Links:
     """Return the features of one image that points which it does not see yet have found."""
     image = int(block.image_index[row])
@@ -121,7 +136,7 @@ def _links_in(
     sees = np.zeros(tracks.num_tracks, bool)
     sees[tracks.track_index[in_image]] = True
     points = np.flatnonzero(~sees[block.track_index] & known.is_described)
-    pixel = _pixels(block, row, points)
+    points, pixel = _pixels(block, row, points, cos_view)
     size = np.array([photos[image].width_px, photos[image].height_px])
     inside = np.isfinite(pixel).all(axis=1) & ((pixel >= 0) & (pixel <= size)).all(axis=1)
     points, pixel = points[inside], pixel[inside]
@@ -188,13 +203,32 @@ def _joined(tracks: Tracks, links: _Links) -> Tracks:
     )
 
 
-def _pixels(block: Block, row: int, points: Int[np.ndarray, " points"]) -> Float[np.ndarray, "points 2"]:
-    """Return where points fall in an image; NaN behind the camera."""
+def _cos_of_view(block: Block, photos: tuple[Photo, ...]) -> Float[np.ndarray, " cameras"]:
+    """Return the cosine of the angle from each camera's axis beyond which its images see nothing; -1 where unknown."""
+    found = np.full(len(block.camera_parameters), -1.0)
+    along = np.linspace(0.0, 1.0, _BORDER)
+    ends = np.zeros_like(along), np.ones_like(along)
+    border = np.concatenate([np.stack(side, axis=1) for end in ends for side in ((along, end), (end, along))])
+    for camera in np.unique(block.camera_index):
+        row = int(np.flatnonzero(block.camera_index == camera)[0])
+        photo = photos[block.image_index[row]]
+        rays = make_rays(block, np.full(len(border), row), border * [photo.width_px, photo.height_px])
+        axis = Rotation.from_quat(block.quaternion[row], scalar_first=True).as_matrix()[2]
+        angle = np.arccos(np.clip(axis @ rays.direction, -1.0, 1.0)).max()
+        found[camera] = np.cos(min(_MARGIN * angle, np.pi)) if np.isfinite(angle) else -1.0
+    return found
+
+
+def _pixels(
+    block: Block, row: int, points: Int[np.ndarray, " points"], cos_view: float
+) -> tuple[Int[np.ndarray, " seen"], Float[np.ndarray, "seen 2"]]:
+    """Return which of the points an image looks towards, before the camera, and where they fall in it."""
     rotation = Rotation.from_quat(block.quaternion[row], scalar_first=True).as_matrix()
     in_cam = rotation @ block.points_m[points].T + block.translation_m[row][:, None]
+    ahead = (in_cam[2] > 0) & (in_cam[2] >= cos_view * np.sqrt(np.einsum("kn,kn->n", in_cam, in_cam)))
+    points, in_cam = points[ahead], in_cam[:, ahead]
     camera = CAMERAS[block.camera_model](*block.camera_parameters.T)
-    pixel = project_in_cameras(camera, np.full(len(points), block.camera_index[row]), in_cam)
-    return np.where(in_cam[2] > 0, pixel, np.nan).T
+    return points, project_in_cameras(camera, np.full(len(points), block.camera_index[row]), in_cam).T
 
 
 def _distances(

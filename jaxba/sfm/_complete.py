@@ -61,7 +61,9 @@ def complete_tracks(
     cos_view = _cos_of_view(block, photos)
 
     def links_in(row: int) -> _Links:
-        return _links_in(row, block, tracks, features, photos, known, radius_px, cos_view[block.camera_index[row]])
+        return _links_in(
+            row, block, tracks, features, photos, known, radius_px, float(cos_view[block.camera_index[row]])
+        )
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:

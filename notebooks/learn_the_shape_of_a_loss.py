@@ -47,7 +47,7 @@ def check_point_rms(points):
 
 
 # %%
-seeds, shares = range(4), (0.1, 0.3)
+seeds, shares = range(6), (0.1, 0.3)
 plan = jaxba.make_plan(measured(0, 0.1))
 huber, tuned, learned = {}, {}, {}
 for share in shares:

@@ -4,8 +4,8 @@ Simulated blocks with 7000 observations a photo, as photos of 20 megapixels have
 many false ones again), and a view graph with the matches of every two photos of a track. Each survey goes through the
 three stages as `jaxba run` calls them, in a process of its own, and the peak of memory of each stage is printed.
 
-`--max-memory`: what solving in tiles may hold. `--whole`: surveys that are adjusted in one piece as well; prints the
-largest distance of their cameras and points from those of the tiles.
+`--observations`: of a photo. `--max-memory`: what solving in tiles may hold. `--whole`: surveys that are adjusted in
+one piece as well; prints the largest distance of their cameras and points from those of the tiles.
 """
 
 import argparse
@@ -27,7 +27,6 @@ from jaxba.pipeline import adjust, start, tracks
 from jaxba.scene import EdgeStatus, Features, LocalFrame, Photo, Reference, ViewGraph
 from jaxba.simulation import Survey, uav_block
 
-_A_PHOTO = 7000
 _LENGTH = 4.0  # of tracks
 _GNSS_M = (0.02, 0.02, 0.04)
 _LEAST_MATCHES = 30  # of an edge
@@ -113,9 +112,9 @@ def _with_poses(survey: Survey, pairs: np.ndarray, matches: np.ndarray, counts: 
     )
 
 
-def _given(num_photos: int) -> tuple[tuple[Photo, ...], Reference, SimulatedFeatures, ViewGraph]:
+def _given(num_photos: int, observations: int) -> tuple[tuple[Photo, ...], Reference, SimulatedFeatures, ViewGraph]:
     survey = uav_block(
-        num_photos, seed=1, points_per_image=_A_PHOTO / _LENGTH, mean_track_length=_LENGTH, gnss_std_m=_GNSS_M,
+        num_photos, seed=1, points_per_image=observations / _LENGTH, mean_track_length=_LENGTH, gnss_std_m=_GNSS_M,
         outlier_fraction=0.01,
     )  # fmt: skip
     truth, prior = survey.truth, survey.problem.prior("position")
@@ -158,9 +157,9 @@ def _gb(field: str) -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1e6
 
 
-def _one(num_photos: int, max_memory: str, whole: bool, into: Path) -> None:
+def _one(num_photos: int, observations: int, max_memory: str, whole: bool, into: Path) -> None:
     use_compilation_cache()
-    photos, reference, features, view_graph = _given(num_photos)
+    photos, reference, features, view_graph = _given(num_photos, observations)
     before_gb = _gb("VmRSS")
     with _Stage("tracks", before_gb):
         tracked = tracks.run(tracks.Inputs(photos=photos, features=features, view_graph=view_graph), tracks.Params())
@@ -188,19 +187,19 @@ def main() -> None:
     parser.add_argument("--photos", type=int, nargs="*", default=[250, 500, 1000, 1500])
     parser.add_argument("--whole", type=int, nargs="*", default=[250])
     parser.add_argument("--max-memory", default="5GB")
-    parser.add_argument("--one", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--observations", type=int, default=7000)
+    parser.add_argument("--one", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
-        num_photos, max_memory, whole, into = options.one
-        _one(int(num_photos), max_memory, whole == "True", Path(into))
+        num_photos, observations, max_memory, whole, into = options.one
+        _one(int(num_photos), int(observations), max_memory, whole == "True", Path(into))
         return
     with tempfile.TemporaryDirectory() as folder:
         for num_photos in options.photos:
             for whole in (False, True) if num_photos in options.whole else (False,):
-                print(
-                    f"{num_photos} photos, {'in one piece' if whole else f'in tiles, {options.max_memory}'}", flush=True
-                )
-                one = [str(num_photos), options.max_memory, str(whole), f"{folder}/{whole}.npz"]
+                print(f"{num_photos} photos, in {'one piece' if whole else f'tiles, {options.max_memory}'}", flush=True)
+                sizes = str(num_photos), str(options.observations)
+                one = [*sizes, options.max_memory, str(whole), f"{folder}/{whole}.npz"]
                 subprocess.run([sys.executable, "-m", "benchmarks.surveys", "--one", *one], check=True)
             if num_photos in options.whole:
                 tiled, piece = (np.load(f"{folder}/{whole}.npz") for whole in (False, True))

@@ -107,7 +107,10 @@ class WorkerOptions:
     workers: Annotated[int | None, Parameter(help="Processes for features and matches. [default: one a core]")] = None
     max_memory: Annotated[
         str | None,
-        Parameter(help="Memory for all of them: a share of the machine's, or an amount: 4GB, 800MB. [default: 0.8]"),
+        Parameter(
+            help="Memory for all of them, and to solve in tiles: a share of the machine's, or an amount: 4GB, 800MB. "
+            "[default: 0.8]"
+        ),
     ] = None
     time_limit: Annotated[
         float | None,

@@ -69,6 +69,8 @@ class Cluster:
     - `count`: threads of all workers. `memory_bytes`: that the largest worker allows its process.
     """
 
+    more_memory = "raise the --memory-limit of dask worker"
+
     def __init__(self, client: distributed.Client, items: Sequence[Item], resources: Resources) -> None:
         self._client, self._resources = client, resources
         self._reads = sorted({path for item in items for path in item.reads})
@@ -141,9 +143,8 @@ class Cluster:
                 ) from error
             workers = {address: found[address] for address in sorted(found) if address not in self._stuck}
             if new := [address for address in workers if address not in self._alike]:
-                self._require_alike(new)
-                self._alike.update(new)
-            if workers:
+                self._alike |= self._require_alike(new)
+            if workers := {address: workers[address] for address in workers if address in self._alike}:
                 return workers
             if time.monotonic() - begun_s > _PATIENCE_S:
                 raise JaxbaError(
@@ -156,12 +157,15 @@ class Cluster:
     def _where(self) -> str:
         return _where(self._resources)
 
-    def _require_alike(self, addresses: list[str]) -> None:
-        """Raise `JaxbaError` for a worker of other versions, or one that does not see the project as this process."""
+    def _require_alike(self, addresses: list[str]) -> set[str]:
+        """Return the workers that have answered, and are as this process: of its versions, and see what it sees.
+
+        Raises `JaxbaError` for one that is not.
+        """
         here = _about([str(path.absolute()) for path in self._reads])
         found: Any = self._client.run(_about, list(here.seen), workers=addresses, on_error="return")
         for address, there in sorted(found.items()):
-            if isinstance(there, OSError):  # it has just gone
+            if isinstance(there, OSError):  # it has just gone, and is asked again if it comes back
                 continue
             if not isinstance(there, _About):
                 raise JaxbaError(
@@ -181,6 +185,7 @@ class Cluster:
                         f"worker {address} on {there.host} does not see {path} as this machine does. Photos and "
                         "project have to lie on storage that all machines mount under the same path."
                     )
+        return {address for address, there in found.items() if isinstance(there, _About)}
 
 
 class _About(NamedTuple):

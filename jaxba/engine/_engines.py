@@ -19,7 +19,10 @@ class Engine(Protocol):
     """Workers.
 
     - `memory_bytes`: that the largest item may need. `count`: items that are worked on at a time.
+    - `more_memory`: in words, what gives items more of it.
     """
+
+    more_memory: str
 
     @property
     def memory_bytes(self) -> float: ...
@@ -43,7 +46,7 @@ def work(
         fitting = []
         for item in items:
             if item.need_bytes > engine.memory_bytes:
-                yield item, None, too_large(item, engine.memory_bytes)
+                yield item, None, too_large(item, engine.memory_bytes, engine.more_memory)
             else:
                 fitting.append(item)
         again: list[tuple[Item, Ended]] = []
@@ -51,9 +54,13 @@ def work(
             if ended.how == "died" or (ended.how == "memory" and engine.count > 1):
                 again.append((item, ended))
             else:
-                yield item, ended.result, reason_of(ended)
+                yield item, ended.result, reason_of(ended, engine.more_memory)
         for item, ended in engine.worked(call, [item for item, _ in again], alone=True):
-            yield item, ended.result, reason_of(ended, " twice, the second time with no other beside it")
+            yield (
+                item,
+                ended.result,
+                reason_of(ended, engine.more_memory, " twice, the second time with no other beside it"),
+            )
 
 
 def fewer_workers(items: Sequence[Item], resources: Resources) -> str | None:

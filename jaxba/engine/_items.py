@@ -61,19 +61,19 @@ def died(exit_code: int | None) -> Ended:
     return Ended("died", None, f"ended with exit code {exit_code}")
 
 
-def reason_of(ended: Ended, how_often: str = "") -> str | None:
+def reason_of(ended: Ended, more_memory: str, how_often: str = "") -> str | None:
     """Return in words why there is no result; None where there is one."""
     if ended.how == "died":
         return f"{_DIED} {ended.reason}{how_often}: out of memory, or a broken file that crashes the decoder"
     if ended.how == "memory":
-        return f"{_NO_MEMORY}; raise --max-memory, or close other programs"
+        return f"{_NO_MEMORY}; {more_memory}, or close other programs"
     return ended.reason
 
 
-def too_large(item: Item, memory_bytes: float) -> str:
+def too_large(item: Item, memory_bytes: float, more_memory: str) -> str:
     """Return in words that an item needs more memory than there is."""
     need, allowed = in_gb(item.need_bytes), in_gb(memory_bytes)
-    return f"{_TOO_LARGE} {need} of memory, {allowed} are allowed; raise --max-memory"
+    return f"{_TOO_LARGE} {need} of memory, {allowed} are allowed; {more_memory}"
 
 
 def lacked_memory(reason: str) -> bool:

@@ -38,6 +38,8 @@ _DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux
 class LocalWorkers:
     """The engine of this machine: worker processes, as many as its cores and its memory allow for these items."""
 
+    more_memory = "raise --max-memory"
+
     def __init__(self, items: Sequence[Item], resources: Resources) -> None:
         self.resources, self.memory_bytes = resources, resources.memory_bytes
         needs = [item.need_bytes for item in items if item.need_bytes <= self.memory_bytes]

@@ -20,7 +20,9 @@ class Resources(Parameters):
         None, low=1, high=1024, help="processes for features and matches; none: one a core; fewer where memory ends"
     )
     max_memory: float | str = parameter(
-        0.8, help="memory for all of them: a share of the machine's, 0.1 to 0.95, or an amount such as 4GB or 800MB"
+        0.8,
+        help="memory for all of them, and for solving in tiles: a share of the machine's, 0.1 to 0.95, or an amount "
+        "such as 4GB or 800MB",
     )
     time_limit: float | None = parameter(
         None, low=1, high=86400, help="s that a photo may take in a stage; none: 60 and 10 a megapixel or pair"

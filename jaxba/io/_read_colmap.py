@@ -149,10 +149,12 @@ def _points(path: Path) -> list[_Point]:
     with Damage(str(path)) as damage:
         for damage.place, line in content_lines(path):
             words = line.split()
-            *xyz, error = finite([*words[1:4], *words[7:8]])
+            if len(words) < 8 or len(words) % 2:
+                raise ValueError(f"{len(words)} fields; the first eight are ID X Y Z R G B ERROR, the others in pairs")
+            *xyz, error = finite([*words[1:4], words[7]])
             rgb, track = [int(word) for word in words[4:7]], [int(word) for word in words[8:]]
-            if len(words) < 8 or len(track) % 2 or not all(0 <= value <= 255 for value in rgb):
-                raise ValueError(f"{len(words)} fields, the first eight X Y Z R G B and ERROR, the others in pairs")
+            if not all(0 <= value <= 255 for value in rgb):
+                raise ValueError(f"the colour {rgb} is not of three numbers from 0 to 255")
             point = _Point(
                 place=damage.place, point_id=int(words[0]), xyz=xyz, rgb=rgb, error_px=error,
                 track=list(zip(track[0::2], track[1::2], strict=True)),

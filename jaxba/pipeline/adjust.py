@@ -142,8 +142,7 @@ def run(inputs: Inputs, params: Params, max_memory: float | None = None) -> Outp
         inputs.control,
         tiling,
     )
-    room = {"max_memory": max_memory} if tiling.applies(inputs.block, inputs.tracks) else {}
-    sigmas = sfm.uncertainty(adjusted, reference, **room)
+    sigmas = sfm.uncertainty(adjusted, reference)
     controlled = sfm.apply_control(adjusted, sigmas, inputs.control, reference)
     block = controlled.block
     fit = sfm.gnss_fit(block, reference)

@@ -51,6 +51,7 @@ class Adjusted:
     - `medians_px`: of each round's observations after its solve. `converged`: the median no longer changed.
     - `control`: the control points of the last solve, their start values at its solution. `mark_used`: of all marks,
       those that agree with the others of their point. `gnss_offset_m`: added to measured positions, an axis.
+    - `max_memory`: that solving in tiles was allowed; None in one piece.
     - `pruned`: edges left out. `lost`: images that had too few observations left. `notes`: what else was decided.
     """
 
@@ -70,6 +71,7 @@ class Adjusted:
     mark_used: Bool[np.ndarray, " marks"]
     gnss_offset_m: Float[np.ndarray, "3"]
     control: ControlPart | None = None
+    max_memory: float | str | None = None
 
     @property
     def num_rejected(self) -> int:
@@ -189,6 +191,7 @@ def adjust(
         mark_used=mark_used,
         gnss_offset_m=solved.gnss_offset_m,
         control=solved.control,
+        max_memory=rounds.tiling.max_memory if shape is None else None,
     )
 
 

@@ -14,9 +14,7 @@ looks towards; the features of as many images as there are cores are open at a t
 """
 
 import dataclasses
-import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from jaxba.ba import project_in_cameras
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Features, Photo, Tracks
+from jaxba.sfm._cores import on_all_cores
 from jaxba.sfm._rays import make_rays
 
 _NEAREST = 4  # features that compete for a point
@@ -65,12 +64,7 @@ def complete_tracks(
             row, block, tracks, features, photos, known, radius_px, float(cos_view[block.camera_index[row]])
         )
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        try:
-            links = list(pool.map(links_in, range(block.num_images)))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    links = on_all_cores(links_in, range(block.num_images))
     columns = [np.concatenate([getattr(part, name) for part in links]) for name in _Links.__dataclass_fields__]
     return _joined(tracks, _Links(*columns))
 

@@ -15,7 +15,8 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from jaxba.scene import Block, Photo, PrunedEdge, Tracks, ViewGraph
-from jaxba.sfm._points import Triangulated, on_all_cores, pieces
+from jaxba.sfm._cores import on_all_cores
+from jaxba.sfm._points import Triangulated, pieces
 from jaxba.sfm._rays import Rays, make_rays
 
 _LEAST_MATCHES = 5  # fewer have no median to speak of
@@ -75,7 +76,7 @@ def edge_medians_px(
         rays = make_rays(block, found.image_row[rows], tracks.xy_px[found.row[rows]])
         error[here] = epipolar_px(rays.take(one), rays.take(other))
 
-    on_all_cores(of_piece, pieces(np.bincount(edge, minlength=num_edges), _PIECE))
+    on_all_cores(of_piece, *zip(*pieces(np.bincount(edge, minlength=num_edges), _PIECE), strict=True))
     for side in (first, second):
         of_point = np.where(found.is_point[found.of_track[side]], found.error_px[side], 0.0)
         error = np.fmax(error, of_point)

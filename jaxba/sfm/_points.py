@@ -18,15 +18,14 @@ are wrong.
 
 import dataclasses
 import itertools
-import os
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
 from jaxba.scene import Block, Tracks
+from jaxba.sfm._cores import on_all_cores
 from jaxba.sfm._rays import Rays, make_rays
 
 _MAX_PAIRS = 45  # of one track's rays: all of them up to ten rays
@@ -123,7 +122,7 @@ def triangulate_tracks(
         found = _Tracks.of(rays, counts[piece], middle_m, limit_px[rows]).triangulated(min_angle_rad)
         point[:, piece], error[rows], is_used[rows], is_point[piece] = found
 
-    on_all_cores(triangulate, pieces(counts, _PIECE))
+    on_all_cores(triangulate, *zip(*pieces(counts, _PIECE), strict=True))
     return Triangulated(row, image_row, of_track, track_index, point.T.copy(), error, is_used, is_point)
 
 
@@ -139,16 +138,6 @@ def pieces(counts: Int[np.ndarray, " groups"], most: int) -> Iterator[tuple[slic
         last = max(int(np.searchsorted(ends, first_row + most, side="right")), first + 1)
         yield slice(first, last), slice(first_row, int(ends[last - 1]))
         first, first_row = last, int(ends[last - 1])
-
-
-def on_all_cores(work: Callable[[slice, slice], None], of_pieces: Iterable[tuple[slice, slice]]) -> None:
-    """Call `work` with each piece, whose results go to places of their own: numpy holds no lock while it computes."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        try:
-            list(pool.map(work, *zip(*of_pieces, strict=True)))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def redundancy_root(views: Int[np.ndarray, " tracks"]) -> Float[np.ndarray, " tracks"]:

@@ -55,8 +55,8 @@ class Settings:
 class Tiling:
     """When a block is solved in tiles, and in how much memory; it changes the answer by rounding alone.
 
-    - `chunk_size`: a block of more images is solved in tiles of at most so many. `max_observations`: so is one of more
-      observations. `max_memory`: that solving may take, as `solve_tiled` has it.
+    - `chunk_size`: a block of more images is solved in tiles, at least as many as it has chunks of this size.
+    - `max_observations`: a block of more is solved in tiles as well. `max_memory`: as in `solve_tiled`.
     """
 
     chunk_size: int = 500

@@ -35,7 +35,8 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import Covariance, covariance
 from jaxba.scene import Block, Reference
 from jaxba.sfm._adjust import Adjusted
-from jaxba.sfm._points import on_all_cores, pieces, redundancy_root
+from jaxba.sfm._cores import on_all_cores
+from jaxba.sfm._points import pieces, redundancy_root
 from jaxba.sfm._problem import used_positions
 from jaxba.sfm._rays import make_rays
 
@@ -61,11 +62,8 @@ class Uncertainty:
     covariance: Covariance | None = None
 
 
-def uncertainty(adjusted: Adjusted, reference: Reference, *, max_memory: float | str | None = None) -> Uncertainty:
-    """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured.
-
-    - `max_memory`: as in `covariance`.
-    """
+def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
+    """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured."""
     block = adjusted.block
     position, point = np.full((block.num_images, 3), np.nan), np.full((block.num_points, 3), np.nan)
     times = spread(adjusted)
@@ -76,7 +74,7 @@ def uncertainty(adjusted: Adjusted, reference: Reference, *, max_memory: float |
     problem = dataclasses.replace(adjusted.problem, observations=observations)
     loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
-        found = covariance(problem, loss=loss, max_memory=max_memory)
+        found = covariance(problem, loss=loss, max_memory=adjusted.max_memory)
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")
@@ -154,7 +152,7 @@ def own_variance(block: Block, std_px: float) -> Float[np.ndarray, "points 3"]:
         inverse = np.linalg.pinv(normal, hermitian=True)
         variance[points] = np.maximum(np.einsum("nii->ni", inverse), 0.0)
 
-    on_all_cores(of_piece, pieces(counts, _PIECE))
+    on_all_cores(of_piece, *zip(*pieces(counts, _PIECE), strict=True))
     return variance
 
 

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -104,6 +103,7 @@ def test_an_item_that_no_worker_has_the_memory_for_is_named(scheduler: Path):
     large = Item(name="large", arguments=(1,), need_bytes=1e15)
     ((_, result, reason),) = list(work(double, [large], Resources(scheduler_file=str(scheduler))))
     assert result is None and reason is not None and reason.startswith("needs about 1000000.0 GB of memory")
+    assert reason.endswith("raise the --memory-limit of dask worker")
 
 
 def test_a_worker_of_other_versions_is_refused_by_name(scheduler: Path, monkeypatch: pytest.MonkeyPatch):
@@ -174,7 +174,6 @@ def test_a_run_on_a_cluster_makes_the_same_bytes_though_workers_are_killed(
     own = Survey(photos, tmp_path / "project")
     run = own.run(f"workers.scheduler_file={scheduler}", tell=kill_one)
     assert len(killed) == 2 and not run.facts["left_out"]
-    assert threading.active_count() < 50
     names = sorted(path.relative_to(made.project) for path in (made.project / "export").rglob("*") if path.is_file())
     assert names
     for name in names:

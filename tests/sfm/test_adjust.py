@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from simulated import Simulated, simulate, view_graph_of
 
-from jaxba import JaxbaError, solve_tiled
+from jaxba import JaxbaError, solve, solve_tiled
 from jaxba.ba import _descend
 from jaxba.scene import Block, Tracks
 from jaxba.sfm import Adjusted, Settings, Tiling, Uncertainty, _rounds, adjust, uncertainty
@@ -149,6 +149,17 @@ def test_rounds_are_deterministic(clean: Simulated, adjusted_clean: Adjusted) ->
     again = _run(clean)
     for name in ("quaternion", "translation_m", "camera_parameters", "points_m", "observation_xy_px"):
         np.testing.assert_array_equal(getattr(again.block, name), getattr(adjusted_clean.block, name))
+
+
+def test_early_rounds_end_early_and_the_last_at_the_optimum(clean: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
+    # breaks where a round that settles keeps the end of an early one, at 1e-4 of the cost
+    ends = []
+    monkeypatch.setattr(_rounds, "solve", lambda *a, **options: ends.append(options["ftol"]) or solve(*a, **options))
+    found = _run(clean, max_rounds=9)  # it settles before
+    assert ends[0] == 1e-4 and ends[-1] == Settings().ftol and set(ends) == {1e-4, Settings().ftol}
+    assert len(ends) == len(found.medians_px) + 1  # the round that settled went on
+    history = solve(found.problem, loss=found.loss, ftol=1e-13, xtol=1e-12).report.history
+    assert history[0].cost - history[-1].cost < 1e-9 * history[0].cost
 
 
 IN_TILES = Tiling(chunk_size=5)

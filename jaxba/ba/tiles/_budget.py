@@ -69,7 +69,8 @@ def plan_memory(
             f"{label}: {size_text(held + work)} are needed: {size_text(held)} for the problem with "
             f"{problem.num_points:,} points and what is loaded, {size_text(work)} for {workers} tiles of up to "
             f"{tile_observations:,.0f} observations in work and the fronts between them. {size_text(limit)} are "
-            "allowed; give solve_tiled more max_memory, fewer workers or smaller tiles (max_observations)."
+            f"allowed; give more max_memory (--max-memory of a command), fewer workers or smaller tiles "
+            "(max_observations)."
         )
     systems, factors = _SYSTEM * problem.num_observations, fronts.bytes_of_factors()
     idle = 0.2 * left

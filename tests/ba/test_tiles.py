@@ -346,7 +346,7 @@ def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path, content: byte
         ({"max_memory": "lots"}, "max_memory 'lots': give an amount from 100MB such as 4GB"),
         (
             {"max_memory": "100MB"},
-            "are needed: .* for the problem with .* points .* 100.0 MB are allowed; give solve_tiled more",
+            "are needed: .* for the problem with .* points .* 100.0 MB are allowed; give more max_memory",
         ),
         ({"num_tiles": 0}, "num_tiles is 0; give a whole number, 1 or more"),
         ({"max_observations": 0.5}, "max_observations is 0.5; give a number"),

@@ -22,7 +22,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxba import sfm
+from jaxba._sizes import bytes_of
 from jaxba.engine._compile_cache import use_compilation_cache
+from jaxba.engine._stage import Room
 from jaxba.pipeline import adjust, start, tracks
 from jaxba.scene import EdgeStatus, Features, LocalFrame, Photo, Reference, ViewGraph
 from jaxba.simulation import Survey, uav_block
@@ -173,7 +175,8 @@ def _one(num_photos: int, observations: int, max_memory: str, whole: bool, into:
     with _Stage("adjust", before_gb), tiling:
         chunk_size = 500 if num_photos > 500 else None
         inputs = adjust.Inputs(**given, block=block, features=features, chunk_size=chunk_size)
-        found = adjust.run(inputs, adjust.Params(), max_memory)
+        room = Room(bytes_of(max_memory, 1.0), into.parent)
+        found = adjust.run(inputs, adjust.Params(), room)
     print(f"         {adjust.lines(found, _nothing_told(photos))[0]}", flush=True)
     np.savez(into, centers_m=found.block.centers_m, points_m=found.block.points_m, std_m=found.point_std_m)
 

@@ -5,6 +5,7 @@ project/
   run.json             the folders and lists that it was given, and the stage that it is in
   photos.json          size, time and SHA-256 of each file, so that a file is read again only when it changed
   stages/<stage>/      what the stage made; features and match hold a folder a photo
+  unfinished/<stage>/  what a stage that does all photos at once has done so far, where it was stopped
   export/              the results
   summary.json         what became of each stage and each photo
   .lock, .lock.holder  held by the run that works here; who that is
@@ -80,6 +81,26 @@ class Project:
         """Return the folder of what a stage made, or made of one photo."""
         folder = self.folder.absolute() / "stages" / name  # which holds wherever it is worked on
         return folder if photo is None else folder / _folder_name(photo)
+
+    def unfinished(self, name: str, key: str) -> Path:
+        """Return the folder of what a stage has done so far under a key; what it did under another one is removed."""
+        folder = self._unfinished(name) / key
+        if not folder.exists():
+            self.forget_unfinished(name)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise cannot_write(folder, error) from error
+        return folder
+
+    def forget_unfinished(self, name: str) -> None:
+        """Remove what a stage has done so far: it has ended."""
+        shutil.rmtree(self._unfinished(name), ignore_errors=True)
+        with contextlib.suppress(OSError):  # another stage's lies there, or there is none
+            self._unfinished(name).parent.rmdir()
+
+    def _unfinished(self, name: str) -> Path:
+        return self.folder / "unfinished" / name
 
     def remove_if_new(self) -> None:
         """Remove what this object made, where the project's folder was not there or empty."""

@@ -28,6 +28,18 @@ class Item:
 
 
 @dataclass(frozen=True)
+class Room:
+    """What a stage that does all photos at once may use; it changes no result.
+
+    - `memory_bytes`: that the process may hold. `folder`: for what it has done so far, so that a run that was stopped
+      goes on from there; it is there, and gone when the stage has ended.
+    """
+
+    memory_bytes: float
+    folder: Path
+
+
+@dataclass(frozen=True)
 class Stage:
     """A stage and how it is fed.
 
@@ -39,7 +51,7 @@ class Stage:
     - `writes_files`: what it makes are files for others, in the project's folder of exports.
     - `reads_places`: where its inputs lie counts, not their contents alone.
     - `reads_given`: its inputs are photos and lists that may have moved since.
-    - `takes_memory`: its `run` is told the bytes that it may take, which change no result.
+    - `takes_room`: its `run` is given a `Room`.
     """
 
     module: ModuleType
@@ -51,7 +63,7 @@ class Stage:
     writes_files: bool = False
     reads_places: bool = False
     reads_given: bool = False
-    takes_memory: bool = False
+    takes_room: bool = False
 
     @property
     def name(self) -> str:

@@ -18,13 +18,14 @@ from jaxba._atomic import write_folder_atomically
 from jaxba._errors import JaxbaError
 from jaxba.engine import _store
 from jaxba.engine._engines import fewer_workers, work as work_on
+from jaxba.engine._fingerprint import fingerprint
 from jaxba.engine._items import Item
 from jaxba.engine._limits import check_failures
 from jaxba.engine._lock import holder_file, locked
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists, refuse_photo_folder
 from jaxba.engine._settings import Settings, to_toml
-from jaxba.engine._stage import Stage, left_out
+from jaxba.engine._stage import Room, Stage, left_out
 from jaxba.engine._work import Work, collected, failures, run_one, why_to_do, without_path, works
 from jaxba.engine._workers import Resources, memory_for
 from jaxba.pipeline._done import Done
@@ -148,13 +149,16 @@ def _run_stage(
 
 
 def _run_whole(project: Project, stage: Stage, item: Work, params: Parameters, resources: Resources) -> None:
-    room = {"max_memory": resources.memory_bytes} if stage.takes_memory else {}
     if stage.writes_files:
         with write_folder_atomically(project.export) as partial:
-            outputs = stage.module.run(replace(item.inputs, folder=partial), params, **room)
+            outputs = stage.module.run(replace(item.inputs, folder=partial), params)
+    elif stage.takes_room:
+        room = Room(resources.memory_bytes, project.unfinished(stage.name, fingerprint(item.key)))
+        outputs = stage.module.run(item.inputs, params, room)
     else:
-        outputs = stage.module.run(item.inputs, params, **room)
+        outputs = stage.module.run(item.inputs, params)
     _store.save(item.folder, outputs, item.key)
+    project.forget_unfinished(stage.name)
 
 
 def _run_photos(

@@ -213,7 +213,7 @@ STAGES = (
     Stage(match, _match, _match_collected, lambda done: done.match_left_out),
     Stage(tracks, _tracks),
     Stage(start, _start, left_out=lambda done: done.start.block.unregistered),
-    Stage(adjust, _adjust, left_out=lambda done: done.adjust.block.unregistered, takes_memory=True),
+    Stage(adjust, _adjust, left_out=lambda done: done.adjust.block.unregistered, takes_room=True),
     Stage(export, _export, writes_files=True),
 )
 NAMES = tuple(stage.name for stage in STAGES)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.engine._parameters import Parameters, parameter
+from jaxba.engine._stage import Room
 from jaxba.engine._words import many
 from jaxba.report import Told, control_facts, grouped, sentences
 from jaxba.scene import (
@@ -118,10 +119,8 @@ class Outputs:
         return self.control.gnss_minus_control_m
 
 
-def run(inputs: Inputs, params: Params, max_memory: float | None = None) -> Outputs:
-    """Adjust the block.
-
-    - `max_memory`: bytes that this process may hold where the block is solved in tiles; it changes no result.
+def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
+    """Adjust the block; `room` is for solving it in tiles.
 
     Raises `JaxbaError` where it has fewer than two images, or no point of it is left.
     """
@@ -130,7 +129,9 @@ def run(inputs: Inputs, params: Params, max_memory: float | None = None) -> Outp
     options = {f.name: getattr(params, f.name) for f in fields(params) if f.name != "min_angle"}
     settings = sfm.Settings(min_angle_rad=float(np.deg2rad(params.min_angle)), **options)
     reference, photos = inputs.reference, inputs.photos
-    tiling = sfm.Tiling(chunk_size=inputs.chunk_size or inputs.block.num_images, max_memory=max_memory)
+    tiling = sfm.Tiling(chunk_size=inputs.chunk_size or inputs.block.num_images)
+    if room is not None:
+        tiling = dataclasses.replace(tiling, max_memory=room.memory_bytes, checkpoint=room.folder)
     adjusted = sfm.adjust(
         inputs.block,
         inputs.tracks,

@@ -129,7 +129,7 @@ def adjust(
         to_the_end = last or settled
         steps = settings.max_nfev if to_the_end else _ROUND_STEPS if medians else _FIRST_STEPS
         solve = functools.partial(
-            rounds.solve, std_px=std_px, free=free, mark_used=mark_used, shape=shape, is_later=bool(medians)
+            rounds.solve, std_px=std_px, free=free, mark_used=mark_used, shape=shape, number=len(medians) + 1
         )
         ftol = settings.ftol if to_the_end else max(settings.ftol, _ROUND_FTOL)
         solved = solve(block, max_nfev=min(steps, settings.max_nfev), ftol=ftol)

@@ -7,7 +7,9 @@ block is solved in tiles, to the same answer, in as much memory as it is given (
 import dataclasses
 import logging
 import math
+import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -57,11 +59,14 @@ class Tiling:
 
     - `chunk_size`: a block of more images is solved in tiles, at least as many as it has chunks of this size.
     - `max_observations`: a block of more is solved in tiles as well. `max_memory`: as in `solve_tiled`.
+    - `checkpoint`: a folder in which solves in tiles keep where they stand: rounds that were broken off go through it
+      again, to the same bytes as without a break.
     """
 
     chunk_size: int = 500
     max_observations: int = 1_000_000  # 2.1 GB in one piece, and slower there
     max_memory: float | str | None = None
+    checkpoint: Path | None = None
 
     def applies(self, block: Block, tracks: Tracks) -> bool:
         """Return whether the block is solved in tiles."""
@@ -103,12 +108,13 @@ class Rounds:
         *,
         max_nfev: int,
         ftol: float,
-        is_later: bool,
+        number: int,
     ) -> Solved:
         """Solve a block; `free` are the camera's parameters that may change, `shape` is of `shape`.
 
-        - `mark_used`: of all marks of control. `is_later`: than the first round.
+        - `mark_used`: of all marks of control. `number`: of the round, from 1.
         """
+        is_later = number > 1
         settings = self.settings
         model = LOSSES[settings.loss]
         loss = Linear() if model is Linear else model(f_scale=settings.f_scale / std_px)  # type: ignore[call-arg]
@@ -140,8 +146,10 @@ class Rounds:
             tiles: dict[str, Any] = {
                 "num_tiles": math.ceil(block.num_images / self.tiling.chunk_size),
                 "max_memory": self.tiling.max_memory,
+                "checkpoint": self.tiling.checkpoint,
             }
-            solution = solve_tiled(problem, loss=loss, callback=_tell_step, **tiles, **stops)
+            told = _Told(number)
+            solution = solve_tiled(problem, loss=loss, callback=told.step, on_tile=told.tile, **tiles, **stops)
         else:
             solution = solve(problem, loss=loss, plan=make_plan(problem, like=shape), **stops)
         if solution.result == "interrupted":
@@ -184,8 +192,24 @@ class Rounds:
         return make_plan(problem, spare=_SPARE).shape
 
 
-def _tell_step(step: HistoryStep) -> None:
-    _log.info("step %d, %.0f s", step.step, step.seconds)
+class _Told:
+    """Logs where a solve in tiles is, and how long a step still takes if it takes as long as the last one."""
+
+    def __init__(self, number: int) -> None:
+        self.round, self.num_steps = number, 0
+        self.begun_s, self.last_s = time.monotonic(), math.nan
+
+    def tile(self, done: int, total: int) -> None:
+        """Log that so many of a step's tiles are done."""
+        left_s = self.last_s * (1 - done / total)
+        left = f", {left_s:.0f} s left of this step" if left_s >= 1 else ""
+        _log.info("round %d, step %d, tile %d of %d%s", self.round, self.num_steps + 1, done, total, left)
+
+    def step(self, step: HistoryStep) -> None:
+        """Log that a step has ended."""
+        now_s = time.monotonic()
+        self.num_steps, self.begun_s, self.last_s = step.step, now_s, now_s - self.begun_s
+        _log.info("round %d, step %d, %.0f s", self.round, step.step, step.seconds)
 
 
 def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:

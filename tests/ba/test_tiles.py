@@ -316,6 +316,22 @@ def test_a_second_call_goes_on_from_the_checkpoint_to_the_same_bytes(tmp_path: P
     assert not path.exists()
 
 
+def test_a_folder_keeps_a_checkpoint_of_each_solve(tmp_path: Path) -> None:
+    # breaks where solves share a file, the second call takes a step, or gets what other stops have led to
+    problem, steps, done = _everything(), [], []
+    options = {"loss": Huber(1.0), "num_tiles": 4, "checkpoint": tmp_path, "callback": steps.append}
+    first = jaxba.solve_tiled(problem, **options, max_nfev=2)
+    again = jaxba.solve_tiled(problem, **options, max_nfev=2, on_tile=lambda *tile: done.append(tile))
+    assert len(steps) == 2 and not done and len(list(tmp_path.iterdir())) == 1
+    for value, same in zip(
+        *(jax.tree.leaves(dataclasses.replace(solution, report=None)) for solution in (first, again)), strict=True
+    ):
+        np.testing.assert_array_equal(value, same)
+    further = jaxba.solve_tiled(problem, **options, max_nfev=3, on_tile=lambda *tile: done.append(tile))
+    assert further.num_steps == 3 and len(steps) == 5 and len(list(tmp_path.iterdir())) == 2
+    assert done == [(number, 8) for number in range(1, 9)] * 3
+
+
 def test_a_checkpoint_that_cannot_be_written_is_refused_or_told(tmp_path: Path) -> None:
     with pytest.raises(JaxbaError, match=r"nowhere/standing: not written, .*create the folder first"):
         jaxba.solve_tiled(_everything(), checkpoint=tmp_path / "nowhere" / "standing")

@@ -15,6 +15,8 @@ from small_survey import FAST, NUM_PHOTOS, Survey, repaint
 from jaxba import JaxbaError
 from jaxba.engine import changed, from_toml
 from jaxba.engine._fingerprint import fingerprint
+from jaxba.engine._stage import Room
+from jaxba.engine._store import load
 from jaxba.pipeline import NAMES, PIPELINE, Done, Event, adjust, export, run_pipeline, start
 from jaxba.scene import Finding
 
@@ -203,6 +205,30 @@ def test_a_stopped_run_goes_on_with_the_photos_that_are_left(photos: Path, tmp_p
     assert max(total for stage, total in totals if stage == "features") == len(after) - len(before)
     assert made_anew(before, after) == set(after) - set(before) and len(run.done.features) == NUM_PHOTOS
     assert "stopped" not in json.loads((survey.project / "summary.json").read_text())
+
+
+def test_what_the_adjustment_has_done_when_it_is_stopped_is_kept_for_the_same_settings(
+    made: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # breaks where a stop loses it, other settings get it, or it is left behind
+    survey, seen = made.copy(tmp_path), []
+    outputs = load(survey.project / "stages" / "adjust", adjust.Outputs)
+
+    def run(inputs: object, params: object, room: Room) -> object:
+        seen.append(sorted(path.name for path in room.folder.iterdir()))
+        (room.folder / f"solve-{len(seen)}").touch()
+        if len(seen) < 4:
+            raise KeyboardInterrupt
+        return outputs
+
+    monkeypatch.setattr(adjust, "run", run)
+    for changes in (["adjust.f_scale=1.1"], ["adjust.f_scale=1.1"], ["adjust.f_scale=1.2"]):
+        with pytest.raises(KeyboardInterrupt):
+            survey.run(*changes)
+    assert (survey.project / "unfinished").is_dir()
+    survey.run("adjust.f_scale=1.2", until="adjust")
+    assert seen == [[], ["solve-1"], [], ["solve-3"]]
+    assert not (survey.project / "unfinished").exists()
 
 
 def test_a_run_stops_after_the_stage_that_it_is_told_and_the_project_keeps_the_rest(made: Survey, tmp_path: Path):

@@ -1,7 +1,9 @@
 """The adjustment in rounds against simulated truth: wrong features, a wrong edge, wrong GNSS positions."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
@@ -12,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from simulated import Simulated, simulate, view_graph_of
 
 from jaxba import JaxbaError, solve, solve_tiled
-from jaxba.ba import _descend
+from jaxba.ba import HistoryStep, _descend
 from jaxba.scene import Block, Tracks
 from jaxba.sfm import Adjusted, Settings, Tiling, Uncertainty, _rounds, adjust, uncertainty
 from jaxba.sfm._edges import match_rows, without_edges
@@ -193,6 +195,40 @@ def test_ctrl_c_ends_the_rounds(clean: Simulated, tiling: Tiling | None, monkeyp
     monkeypatch.setattr(_descend, "_history_step", press)
     with pytest.raises(KeyboardInterrupt):
         _run(clean, tiling)
+
+
+def test_rounds_that_were_stopped_go_on_to_the_same_bytes(
+    clean: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    # breaks where a solve's beginning depends on what was broken off, where steps are taken again, or progress is false
+    def steps_of(stop_at: tuple[int, int] | None = None) -> list[tuple[int, int]]:
+        steps, plain = [], _rounds._Told.step
+
+        def step(told: _rounds._Told, tried: HistoryStep) -> None:
+            plain(told, tried)
+            steps.append((told.round, tried.step))
+            if steps[-1] == stop_at:
+                raise KeyboardInterrupt
+
+        monkeypatch.setattr(_rounds._Told, "step", step)
+        found.append(None)
+        with contextlib.suppress(KeyboardInterrupt):
+            found[-1] = _run(clean, replace(IN_TILES, checkpoint=tmp_path if stop_at or len(found) > 1 else None))
+        monkeypatch.setattr(_rounds._Told, "step", plain)
+        return steps
+
+    found: list[Adjusted | None] = []
+    caplog.set_level("INFO", "jaxba.sfm")
+    whole = steps_of()
+    assert "round 1, step 2, tile 6 of 6" in caplog.text and "tile 7" not in caplog.text
+    stop_at = next(pair for pair in whole if pair[0] == 2)
+    assert steps_of(stop_at) == whole[: whole.index(stop_at) + 1] and found[1] is None
+    assert steps_of() == whole[whole.index(stop_at) + 1 :]
+    once, again = found[0], found[2]
+    assert once is not None and again is not None
+    for name in ("centers_m", "points_m", "camera_parameters", "observation_xy_px"):
+        np.testing.assert_array_equal(getattr(once.block, name), getattr(again.block, name))
+    assert once.medians_px == again.medians_px and once.solution.result == again.solution.result
 
 
 def test_no_step_of_scipy_lowers_the_cost() -> None:

@@ -1,4 +1,8 @@
-"""Checkpoint: where a long solve stands after each step, in one file, so that a second call goes on from there."""
+"""Checkpoint: where a long solve stands after each step, in one file, so that a second call goes on from there.
+
+In a folder each solve has a file of its own, which stays at its end: work that solves several times goes through the
+same solves again without a step, up to the one that was broken off.
+"""
 
 import dataclasses
 import hashlib
@@ -34,11 +38,17 @@ class Standing:
 
 
 class Checkpoint:
-    """The file of a solve. `problem` and `loss` say which solve it belongs to."""
+    """The file of a solve at `path`, or in a folder there.
 
-    def __init__(self, path: str | os.PathLike[str], problem: Problem, loss: AbstractLoss) -> None:
-        self._path = Path(path)
-        self._solve = _fingerprint(problem, loss)
+    `problem` and `loss` say which solve it belongs to; in a folder `stops`, what ends it, does as well.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], problem: Problem, loss: AbstractLoss, stops: tuple[float, ...]
+    ) -> None:
+        self._solve, self._is_kept = _fingerprint(problem, loss), os.path.isdir(path)
+        name = hashlib.sha256(f"{self._solve}{stops}".encode()).hexdigest()[:16]
+        self._path = Path(path, f"{name}.npz") if self._is_kept else Path(path)
 
     def load(self) -> Standing | None:
         """Return where the solve stood, or None where there is no file yet.
@@ -76,9 +86,10 @@ class Checkpoint:
         except JaxbaError as error:
             warnings.warn(f"{error} The solve goes on without a checkpoint of this step.", RuntimeWarning, stacklevel=2)
 
-    def remove(self) -> None:
-        """Remove the file of a solve that has ended."""
-        self._path.unlink(missing_ok=True)
+    def end(self) -> None:
+        """Remove the file of a solve that has ended, unless it lies in a folder of such files."""
+        if not self._is_kept:
+            self._path.unlink(missing_ok=True)
 
 
 def _numbered(found: dict[str, np.ndarray], name: str, begin: int, end: int) -> list[np.ndarray]:

@@ -147,10 +147,12 @@ class Engine:
         model = self.models.get(number)
         return call_compiled(linearise, self.system(number), part, bend) if model is None else model
 
-    def up(self, hand: Callable[[int], Handed], damping: Float[np.ndarray, ""]) -> Up:
+    def up(
+        self, hand: Callable[[int], Handed], damping: Float[np.ndarray, ""], on_tile: Callable[[], None] = lambda: None
+    ) -> Up:
         """Eliminate all but the border, and keep the factors.
 
-        - `hand`: returns what a tile hands to the fronts. `damping`: see `State`.
+        - `hand`: returns what a tile hands to the fronts. `damping`: see `State`. `on_tile`: called after each tile.
 
         Raises `NotPositive` where the damped equations have no factor.
         """
@@ -161,6 +163,7 @@ class Engine:
         for number in self.tops:
             if number in self.tile_of_node:
                 tile, found = self.tiles[self.tile_of_node[number]][0], next(results)
+                on_tile()
                 updates[number] = found.update
                 steepest = max(steepest, found.steepest)
                 diagonal[tile.order] += found.diagonal

@@ -11,7 +11,7 @@ import numpy as np
 from jaxba.ba._descend import walk
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
-from jaxba.ba._solvers import SchurLevenbergMarquardt, require_stops
+from jaxba.ba._solvers import RUNNING, SchurLevenbergMarquardt, require_stops
 from jaxba.ba._system import centred, from_centred, is_traced, own_unknowns
 from jaxba.ba.checks import prepare
 from jaxba.ba.tiles._checkpoint import Checkpoint, Standing
@@ -36,6 +36,7 @@ def solve_tiled(
     xtol: float = 1e-8,
     gtol: float = 1e-10,
     callback: Callable[[HistoryStep], None] | None = None,
+    on_tile: Callable[[int, int], None] | None = None,
 ) -> Solution:
     """Adjust a problem in tiles: the same steps, and the same solution, as `solve` with Levenberg-Marquardt.
 
@@ -48,7 +49,9 @@ def solve_tiled(
     - `folder`: for these files; the system's own for such files if None. They are gone at the end.
     - `workers`: tiles that are worked on at a time; as many as there are cores if None. It does not change the result.
     - `checkpoint`: a file that holds where the solve stands after each step. A call that finds it goes on from there,
-      to the same bytes as without a break; it is gone when the solve has ended by itself.
+      to the same bytes as without a break; it is gone when the solve has ended by itself. In a folder each solve has a
+      file of its own, which stays: the same call then finds the solution there.
+    - `on_tile`: called with how many tiles of a step are done, each once on the way up and once down, and of how many.
 
     Raises `JaxbaError` as `solve` does, and where memory or disk do not suffice.
 
@@ -75,7 +78,7 @@ def solve_tiled(
     }
 
     def on_host(problem: Problem, loss: AbstractLoss) -> Solution:
-        return in_tiles("solve_tiled", problem, loss, solver, max_nfev, callback, checkpoint, room)
+        return in_tiles("solve_tiled", problem, loss, solver, max_nfev, callback, checkpoint, room, on_tile)
 
     if is_traced((problem, loss)):
         return solve_reversibly(
@@ -93,10 +96,12 @@ def in_tiles(
     callback: Callable[[HistoryStep], None] | None,
     checkpoint: str | os.PathLike[str] | None,
     room: dict[str, Any],
+    on_tile: Callable[[int, int], None] | None = None,
 ) -> Solution:
     """Return the solution, for the function named `label`; `room` are options of `opened`."""
     begun = time.perf_counter()
-    kept = None if checkpoint is None else Checkpoint(checkpoint, problem, loss)
+    stops = float(max_nfev), solver.rtol, solver.atol, solver.xtol
+    kept = None if checkpoint is None else Checkpoint(checkpoint, problem, loss, stops)
     standing = None if kept is None else kept.load()
     prepared = prepare(problem)
     problem = prepared.problem
@@ -104,8 +109,9 @@ def in_tiles(
     with opened(label, near, loss, **room) as engine:
         start = own_unknowns(near)
         set_up = time.perf_counter()
-        stepper = Stepper(engine, solver)
-        stepper.compile(start)
+        stepper = Stepper(engine, solver, on_tile)
+        if standing is None or int(standing.state.status) == RUNNING:
+            stepper.compile(start)
         compiled = time.perf_counter()
         costs = engine.costs(start)
         if standing is None:
@@ -120,7 +126,7 @@ def in_tiles(
             save=None if kept is None else kept.save,
         )
         if kept is not None and not interrupted:
-            kept.remove()
+            kept.end()
         costs = (costs[0], state.cost, costs[1], engine.costs(found)[1])
     report = Report(
         history=tuple(history),

@@ -33,10 +33,12 @@ from jaxba.geometry import Pose
 
 
 class Stepper:
-    """Takes steps of a solver with an engine."""
+    """Takes steps of a solver with an engine; `on_tile`: see `solve_tiled`."""
 
-    def __init__(self, engine: Engine, solver: SchurLevenbergMarquardt) -> None:
-        self.engine = engine
+    def __init__(
+        self, engine: Engine, solver: SchurLevenbergMarquardt, on_tile: Callable[[int, int], None] | None = None
+    ) -> None:
+        self.engine, self._on_tile, self._num_done = engine, on_tile, 0
         self._numbers, rest = take_numbers(solver, np.float64)
         self._judge = _judge_with(rest)
 
@@ -47,8 +49,9 @@ class Stepper:
     def step(self, unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
         """Return the unknowns and the state after a step was tried."""
         damping, bend = np.asarray(state.trust), np.asarray(state.bend)
+        self._num_done = 0
         try:
-            up = self.engine.up(self.engine.step_equations(unknowns, damping, bend), damping)
+            up = self.engine.up(self.engine.step_equations(unknowns, damping, bend), damping, self._tell_tile)
         except NotPositive:
             return unknowns, call_compiled(self._judge, self._numbers, state, jax.tree.map(np.asarray, _NOTHING_TRIED))
         trial, sums, squared_norm = self._down(unknowns, self._border(unknowns, up.update), damping, bend)
@@ -68,6 +71,11 @@ class Stepper:
         }
         judged = call_compiled(self._judge, self._numbers, state, jax.tree.map(np.asarray, tried))
         return (trial if judged.accepted else unknowns), judged
+
+    def _tell_tile(self) -> None:
+        self._num_done += 1
+        if self._on_tile is not None:
+            self._on_tile(self._num_done, 2 * len(self.engine.tiles))
 
     def _border(self, unknowns: Unknowns, top: Float[np.ndarray, "tail tail"]) -> Float[np.ndarray, " border"]:
         """Return the border's solution from what the root hands on."""
@@ -106,6 +114,7 @@ class Stepper:
         totals = Sums(*[np.zeros(()) for _ in Sums._fields])
         for (tile, _), (part, sums) in zip(self.engine.tiles, self.engine.each_tile(work), strict=True):
             tile.put(part, trial)
+            self._tell_tile()
             totals = Sums(*[total + own for total, own in zip(totals, sums, strict=True)])
         if self.engine.shape.own_cameras:
             refined = np.flatnonzero(self.engine.shape.refined)

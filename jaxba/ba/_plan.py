@@ -41,8 +41,8 @@ PAIR_CHUNK = 256  # pair runs gathered at a time: 1.2 MB of 6x3 blocks, about th
 LinearSolver = Literal["auto", "dense", "banded", "cg"]
 
 
-class Plan(eqx.Module):
-    """Index arrays of a problem's structure; `shape` is static."""
+class Orders(eqx.Module):
+    """Where everything of a problem stands in the solver; `shape` is static."""
 
     image_order: Int[Array | np.ndarray, " images"]
     """Original index of each image, in solver order (without padding)."""
@@ -51,6 +51,12 @@ class Plan(eqx.Module):
     """Original index of each camera in solver order: that of the images where each has its own."""
     row_observation: Int[Array | np.ndarray, " rows"]
     """Original index of the observation in each row, -1 for padding."""
+    shape: PlanShape = eqx.field(static=True)
+
+
+class Plan(Orders):
+    """Index arrays of a problem's structure: its orders, and who meets whom."""
+
     row_image: Int[Array | np.ndarray, " rows"]
     row_point: Int[Array | np.ndarray, " rows"]
     point_image: Int[Array | np.ndarray, " padded_points"]
@@ -62,7 +68,10 @@ class Plan(eqx.Module):
     block_row: Int[Array | np.ndarray, " blocks"]
     block_column: Int[Array | np.ndarray, " blocks"]
     """Images of each off-diagonal block, row > column; padding repeats the last image in both."""
-    shape: PlanShape = eqx.field(static=True)
+
+    def orders(self) -> Orders:
+        """Return the orders alone, without what takes the memory."""
+        return Orders(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Orders)})
 
 
 def make_plan(

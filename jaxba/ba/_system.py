@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxba.ba._plan import ROW_RUN, LinearSolver, Plan, make_plan
+from jaxba.ba._plan import ROW_RUN, LinearSolver, Orders, Plan, make_plan
 from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._projection import camera_centers
@@ -142,7 +142,7 @@ def own_unknowns(problem: Problem) -> Unknowns:
     return Unknowns(poses, intrinsics, np.array(problem.lever_arm, float), np.array(problem.points, float))
 
 
-def arrange(unknowns: Unknowns, plan: Plan, dtype: Any = np.float64) -> Unknowns:
+def arrange(unknowns: Unknowns, plan: Orders, dtype: Any = np.float64) -> Unknowns:
     """Return unknowns in the problem's order in the solver's, with padding."""
     xp = _namespace((unknowns, plan))
     shape = plan.shape
@@ -161,7 +161,7 @@ def arrange(unknowns: Unknowns, plan: Plan, dtype: Any = np.float64) -> Unknowns
     )
 
 
-def restore(unknowns: Unknowns, plan: Plan) -> Unknowns:
+def restore(unknowns: Unknowns, plan: Orders) -> Unknowns:
     """Return the unknowns in the problem's own order, without padding."""
     xp = _namespace((unknowns, plan))
     image_rank, point_rank = xp.argsort(plan.image_order), xp.argsort(plan.point_order)

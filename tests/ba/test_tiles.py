@@ -28,7 +28,7 @@ _BLOCK = functools.partial(jaxba.synthetic.uav_block, 60, side_overlap=0.7, poin
 
 
 @functools.cache
-def _everything() -> Problem:
+def everything() -> Problem:
     """One shared camera, GNSS under a robust loss with bad fixes, control, a free lever arm, an active bound."""
     survey = _BLOCK(
         outlier_fraction=0.03, lever_arm_m=(0.1, 0.2, 0.1), lever_arm_std_m=0.05, gnss_outlier_fraction=0.05
@@ -47,7 +47,7 @@ def _fixed() -> Problem:
 
 
 @functools.cache
-def _own_cameras() -> Problem:
+def with_own_cameras() -> Problem:
     """A camera for every image, some of them calibrated."""
     problem = _BLOCK(num_cameras=60).problem.fix(intrinsics=["k1", "k2", "p1", "p2", "cx", "cy"])
     calibrated = np.arange(3, 60, 4)
@@ -64,9 +64,9 @@ def _whole(kind: str, max_nfev: int) -> Solution:
 
 _TIGHT = {"ftol": 1e-12, "xtol": 1e-12}
 _KINDS: dict[str, tuple[Callable[[], Problem], AbstractLoss]] = {
-    "everything": (_everything, Huber(1.0)),
+    "everything": (everything, Huber(1.0)),
     "fixed": (_fixed, Linear()),
-    "own cameras": (_own_cameras, Linear()),
+    "own cameras": (with_own_cameras, Linear()),
 }
 
 
@@ -77,7 +77,7 @@ def _tree(problem: Problem, num_tiles: int) -> Tree:
 @pytest.mark.parametrize("num_tiles", [1, 2, 4, 9])
 def test_the_images_of_a_point_stand_on_one_way_to_the_root(num_tiles: int) -> None:
     # breaks where an image is eliminated below a node that still sees it, or a boundary misses one
-    problem = _everything()
+    problem = everything()
     tree = _tree(problem, num_tiles)
     assert len(tree.tiles) == num_tiles
     seen = problem.observations
@@ -103,7 +103,7 @@ def test_the_images_of_a_point_stand_on_one_way_to_the_root(num_tiles: int) -> N
 
 def test_a_tile_has_no_more_observations_than_allowed() -> None:
     # breaks where the share of observations of a cut is taken for its share of tiles without looking again
-    problem = _everything()
+    problem = everything()
     tree = dissect(problem, block=6, border=8, max_observations=1e3)
     assert np.bincount(tree.tile_of_point[problem.observations.point_index]).max() <= 1000
     again = dissect(problem, block=6, border=8, max_observations=1e3)
@@ -112,7 +112,7 @@ def test_a_tile_has_no_more_observations_than_allowed() -> None:
 
 def test_cameras_in_one_place_are_cut_by_the_order_of_points() -> None:
     # breaks where a cut needs that places differ
-    problem = _everything()
+    problem = everything()
     turned = eqx.tree_at(lambda p: p.poses.translation, problem, np.zeros((60, 3)))
     assert len(_tree(turned, 3).tiles) == 3
 
@@ -121,7 +121,7 @@ def test_cameras_in_one_place_are_cut_by_the_order_of_points() -> None:
 def test_fronts_solve_what_numpy_solves(num_tiles: int) -> None:
     # breaks where a block lands in the wrong place, a child is added twice, or damping enters twice
     rng = np.random.default_rng(0)
-    problem = _everything()
+    problem = everything()
     tree = dissect(problem, block=6, border=3, max_observations=1e9, num_tiles=num_tiles)
     fronts = Fronts(tree, 6, 3)
     matrix, rhs = np.zeros((363, 363)), np.zeros(363)
@@ -276,7 +276,7 @@ def test_a_full_disk_names_the_folder_and_the_cure(tmp_path: object, monkeypatch
     monkeypatch.setattr("jaxba.ba.tiles._opened.plan_memory", lambda *_: Budget(0.0, 0.0, 0.0))
     monkeypatch.setattr(_shelf.np, "save", full)
     with pytest.raises(JaxbaError, match=f"{tmp_path}.*No space left on device.*free there.*max_memory"):
-        jaxba.solve_tiled(_everything(), num_tiles=4, folder=str(tmp_path))
+        jaxba.solve_tiled(everything(), num_tiles=4, folder=str(tmp_path))
 
 
 def test_a_lost_file_of_a_tile_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,13 +287,13 @@ def test_a_lost_file_of_a_tile_is_named(tmp_path: Path, monkeypatch: pytest.Monk
             file.unlink()
 
     with pytest.raises(JaxbaError, match=r"jaxba-.*is gone or damaged .*system-2-.*Give a folder of your own"):
-        jaxba.solve_tiled(_everything(), loss=Huber(1.0), num_tiles=4, folder=tmp_path, max_nfev=3, callback=remove)
+        jaxba.solve_tiled(everything(), loss=Huber(1.0), num_tiles=4, folder=tmp_path, max_nfev=3, callback=remove)
     assert not any(tmp_path.iterdir())
 
 
 def test_a_second_call_goes_on_from_the_checkpoint_to_the_same_bytes(tmp_path: Path) -> None:
     # breaks where anything that decides on a step is not kept
-    problem, path = _everything(), tmp_path / "standing"
+    problem, path = everything(), tmp_path / "standing"
     options = {"loss": Huber(1.0), "num_tiles": 4, "max_nfev": 6}
     once = jaxba.solve_tiled(problem, **options)
 
@@ -318,7 +318,7 @@ def test_a_second_call_goes_on_from_the_checkpoint_to_the_same_bytes(tmp_path: P
 
 def test_a_folder_keeps_a_checkpoint_of_each_solve(tmp_path: Path) -> None:
     # breaks where solves share a file, the second call takes a step, or gets what other stops have led to
-    problem, steps, done = _everything(), [], []
+    problem, steps, done = everything(), [], []
     options = {"loss": Huber(1.0), "num_tiles": 4, "checkpoint": tmp_path, "callback": steps.append}
     first = jaxba.solve_tiled(problem, **options, max_nfev=2)
     again = jaxba.solve_tiled(problem, **options, max_nfev=2, on_tile=lambda *tile: done.append(tile))
@@ -334,7 +334,7 @@ def test_a_folder_keeps_a_checkpoint_of_each_solve(tmp_path: Path) -> None:
 
 def test_a_checkpoint_that_cannot_be_written_is_refused_or_told(tmp_path: Path) -> None:
     with pytest.raises(JaxbaError, match=r"nowhere/standing: not written, .*create the folder first"):
-        jaxba.solve_tiled(_everything(), checkpoint=tmp_path / "nowhere" / "standing")
+        jaxba.solve_tiled(everything(), checkpoint=tmp_path / "nowhere" / "standing")
     folder = tmp_path / "folder"
     folder.mkdir()
 
@@ -345,7 +345,7 @@ def test_a_checkpoint_that_cannot_be_written_is_refused_or_told(tmp_path: Path) 
 
     options = {"loss": Huber(1.0), "num_tiles": 4, "max_nfev": 2}
     with pytest.warns(RuntimeWarning, match=r"standing: not written, .*The solve goes on without a checkpoint"):
-        assert jaxba.solve_tiled(_everything(), **options, checkpoint=folder / "standing", callback=gone).num_steps == 2
+        assert jaxba.solve_tiled(everything(), **options, checkpoint=folder / "standing", callback=gone).num_steps == 2
 
 
 @pytest.mark.parametrize("content", [b"", b"PK no archive", b"text"])
@@ -353,7 +353,7 @@ def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path, content: byte
     path = tmp_path / "standing"
     path.write_bytes(content)
     with pytest.raises(JaxbaError, match=r"standing: is no checkpoint that can be read .*remove it to begin anew"):
-        jaxba.solve_tiled(_everything(), checkpoint=path)
+        jaxba.solve_tiled(everything(), checkpoint=path)
 
 
 @pytest.mark.parametrize(
@@ -372,7 +372,7 @@ def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path, content: byte
 )
 def test_options_out_of_range_are_refused(options: dict[str, object], message: str) -> None:
     with pytest.raises(JaxbaError, match=message):
-        jaxba.solve_tiled(_everything(), **options)
+        jaxba.solve_tiled(everything(), **options)
 
 
 def _number_of(theta: tuple[Problem, AbstractLoss], **options: object) -> jax.Array:
@@ -394,7 +394,7 @@ _THETA = {  # and steps, of their size: longer ones of pixels cross the bend of 
 def test_the_gradient_is_that_of_central_differences() -> None:
     # breaks where a tile's part is left out or counts twice, or what a bound holds moves
     with jax.enable_x64(True):
-        problem = _whole("everything", 60).apply(jaxba.ba.prepare(_everything()).problem)  # a few steps from each end
+        problem = _whole("everything", 60).apply(jaxba.ba.prepare(everything()).problem)  # a few steps from each end
         theta = problem, Huber(jnp.array(1.0))
         numbers, rest = eqx.partition(theta, eqx.is_inexact_array)
         found = jax.grad(lambda n: _number_of(eqx.combine(n, rest), **_TIGHT))(numbers)
@@ -404,7 +404,7 @@ def test_the_gradient_is_that_of_central_differences() -> None:
             assert np.any(step)
             changed = theta
             if name == "active bound":  # which moves past where the others start
-                changed = eqx.tree_at(lambda t: t[0].cameras, theta, _everything().cameras)
+                changed = eqx.tree_at(lambda t: t[0].cameras, theta, everything().cameras)
             high, low = (float(_number_of(eqx.tree_at(where, changed, value + s), **_TIGHT)) for s in (step, -step))
             np.testing.assert_allclose(np.sum(slope * step), (high - low) / 2, rtol=1e-3, err_msg=name)
 
@@ -421,10 +421,10 @@ def _grad(problem: Problem, cost: str = "final_cost", **options: object) -> None
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: _grad(_everything(), max_nfev=1), "stopped before it converged"),
+        (lambda: _grad(everything(), max_nfev=1), "stopped before it converged"),
         (lambda: _grad(_fixed()), r"report\.problem of a solve before; this one leaves out: .*image"),
-        (lambda: _grad(_everything(), "initial_cost"), "only final_cost has a derivative"),
-        (lambda: jax.jit(lambda p: jaxba.solve_tiled(p).points)(_everything()), "traced, as inside jit and vmap"),
+        (lambda: _grad(everything(), "initial_cost"), "only final_cost has a derivative"),
+        (lambda: jax.jit(lambda p: jaxba.solve_tiled(p).points)(everything()), "traced, as inside jit and vmap"),
     ],
 )
 def test_what_has_no_gradient_is_refused(call: Callable[[], None], message: str) -> None:
@@ -435,7 +435,7 @@ def test_what_has_no_gradient_is_refused(call: Callable[[], None], message: str)
 def test_a_front_that_is_not_positive_definite_raises_the_damping(monkeypatch: pytest.MonkeyPatch) -> None:
     # breaks where the refusal of a step ends the solve, or leaves a wrong factor behind
     problem, loss = _KINDS["everything"][0](), _KINDS["everything"][1]
-    eliminate, calls = Engine._eliminate, []
+    eliminate, calls = Engine.eliminate, []
 
     def fails_at_first(self: Engine, number: int, *arguments: object, **options: object) -> np.ndarray:
         calls.append(number)
@@ -445,7 +445,7 @@ def test_a_front_that_is_not_positive_definite_raises_the_damping(monkeypatch: p
             raise NotPositive
         return eliminate(self, number, *arguments, **options)
 
-    monkeypatch.setattr(Engine, "_eliminate", fails_at_first)
+    monkeypatch.setattr(Engine, "eliminate", fails_at_first)
     solution = jaxba.solve_tiled(problem, loss=loss, num_tiles=4, **_TIGHT)
     history = solution.report.history
     assert not history[1].accepted and history[1].trust > history[0].trust

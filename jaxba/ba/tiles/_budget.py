@@ -29,8 +29,8 @@ class Budget(NamedTuple):
     idle: float
 
 
-def memory_limit(label: str, max_memory: float | str | None) -> float:
-    """Return the bytes that the process may hold.
+def memory_limit(label: str, max_memory: float | str | None, option: str = "max_memory") -> float:
+    """Return the bytes that a process may hold, of which `option` is given.
 
     Raises `JaxbaError` for what is no amount.
     """
@@ -39,7 +39,7 @@ def memory_limit(label: str, max_memory: float | str | None) -> float:
     limit = bytes_of(max_memory, machine_memory())
     if not limit >= 1e8:
         raise JaxbaError(
-            f"{label}: max_memory {max_memory!r}: give an amount from 100MB such as 4GB, or a share of the "
+            f"{label}: {option} {max_memory!r}: give an amount from 100MB such as 4GB, or a share of the "
             "machine's memory such as 0.5."
         )
     return limit

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxba.ba._plan import Plan, make_plan
+from jaxba.ba._plan import Orders, Plan, make_plan
 from jaxba.ba._plan_shape import PlanShape, alike, bare_shape, larger, num_rows
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._system import System, arrange, make_system, restore
@@ -30,6 +30,7 @@ class Tile:
 
     - `images`, `cameras`, `points`: in the problem's order. `order`: the images in that of elimination, its solver's.
     - `rows`, `prior_rows`: its observations, and its rows of each prior.
+    - `plan`: its orders, in the solver and out of it.
     """
 
     images: Int[np.ndarray, " images"]
@@ -38,7 +39,7 @@ class Tile:
     rows: Int[np.ndarray, " rows"]
     prior_rows: tuple[Int[np.ndarray, " _"], ...]
     order: Int[np.ndarray, " images"]
-    plan: Plan
+    plan: Orders
 
     @property
     def solver_cameras(self) -> Int[np.ndarray, " cameras"]:
@@ -50,6 +51,12 @@ class Tile:
         poses = Pose(unknowns.poses.quaternion[self.images], unknowns.poses.translation[self.images])
         of_tile = Unknowns(poses, unknowns.intrinsics[self.cameras], unknowns.lever_arm, unknowns.points[self.points])
         return arrange(of_tile, self.plan)
+
+    def bare(self) -> "Tile":
+        """Return what work on it needs that is given its part of the unknowns."""
+        none = np.zeros(0, np.int32)
+        bare = dataclasses.replace(self.plan, point_order=none, row_observation=none)
+        return dataclasses.replace(self, points=none, rows=none, prior_rows=(), plan=bare)
 
     def put(self, part: Unknowns, unknowns: Unknowns) -> None:
         """Write poses and points of the tile's solver into all unknowns, which are numpy arrays."""
@@ -75,7 +82,7 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
     owners = {"image_index": owner, "point_index": tree.tile_of_point, "camera_index": of_cameras}
     tile_of_prior = [_tile_of_rows(prior, owners) for prior in problem.priors]
 
-    def part(number: int, like: PlanShape) -> tuple[Problem, Tile]:
+    def part(number: int, like: PlanShape) -> tuple[Problem, Plan, Tile]:
         rows = rows_of_tile[number]
         images = np.unique(np.append(np.asarray(seen.image_index)[rows], np.flatnonzero(unseen & (number == 0))))
         points = np.flatnonzero(tree.tile_of_point == number)
@@ -84,13 +91,14 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
         found = sub_problem(problem, rows, images, points, cameras, chosen)
         order = np.argsort(tree.rank[images]).astype(np.int32)
         plan = make_plan(found, linear_solver="dense", like=like, image_order=order)
-        return found, Tile(images, cameras, points, rows.astype(np.int32), tuple(chosen), images[order], plan)
+        tile = Tile(images, cameras, points, rows.astype(np.int32), tuple(chosen), images[order], plan.orders())
+        return found, plan, tile
 
     for group in alike([len(rows) for rows in rows_of_tile], _LIKE):
-        like = functools.reduce(larger, (part(number, shape)[1].plan.shape for number in group))
+        like = functools.reduce(larger, (part(number, shape)[1].shape for number in group))
         for number in group:
-            found, tile = part(number, like)
-            yield number, tile, make_system(found, tile.plan, loss)
+            found, plan, tile = part(number, like)
+            yield number, tile, make_system(found, plan, loss)
 
 
 def _tile_of_rows(prior: AbstractPrior, owners: dict[str, Int[np.ndarray, " _"]]) -> Int[np.ndarray, " rows"]:

@@ -92,9 +92,12 @@ class _Memory:
         return buffer[:size].reshape(rows, columns)
 
     def give_back(self, matrix: Float[np.ndarray, "rows columns"]) -> None:
+        """Take the memory of a matrix back; not that of one which another process has made."""
         buffer = matrix
         while isinstance(buffer.base, np.ndarray):
             buffer = buffer.base
+        if buffer.ndim != 1 or buffer.base is not None:
+            return
         with self._lock:
             self._free.append(buffer)
             while sum(buffer.nbytes for buffer in self._free) > self.limit:
@@ -122,7 +125,7 @@ class Fronts:
     """
 
     def __init__(self, tree: Tree, block: int, border: int) -> None:
-        self.tree, self.block = tree, block
+        self.tree, self.block, self.border = tree, block, border
         self.tail = tail_size(block, border)
         self.ranks = [tree.rank[np.concatenate([node.eliminated, node.boundary])] for node in tree.nodes]
         self.own = [len(node.eliminated) for node in tree.nodes]

@@ -71,7 +71,7 @@ def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0) -> Margi
     Raises `NotPositive` where the equations have no inverse.
     """
     shape, tree, fronts = engine.shape, engine.tree, engine.fronts
-    up = engine.up(engine.step_equations(unknowns, np.array(damping), np.zeros(())), np.array(damping))
+    up = engine.up(engine.each_part("step_up", unknowns, np.array(damping), np.zeros(())), np.array(damping))
     corner = _inverse(up.update[: shape.border, : shape.border])
     tail = np.zeros((fronts.tail * shape.block,) * 2)
     tail[: shape.border, : shape.border] = corner

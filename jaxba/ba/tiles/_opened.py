@@ -3,8 +3,8 @@
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -15,11 +15,12 @@ from jaxba.ba._plan_shape import bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba.tiles._budget import memory_limit, plan_memory
 from jaxba.ba.tiles._dissect import dissect
+from jaxba.ba.tiles._elsewhere import Elsewhere
 from jaxba.ba.tiles._engine import Engine
 from jaxba.ba.tiles._fronts import Fronts
 from jaxba.geometry import AbstractLoss, require_number
 
-TILE_OBSERVATIONS = 1e5
+TILE_OBSERVATIONS, EXECUTOR_MEMORY = 1e5, "2GB"
 
 
 @contextlib.contextmanager
@@ -34,10 +35,13 @@ def opened(
     folder: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     inverse: bool = False,
+    executors: Sequence[Executor] | None = None,
+    executor_memory: float | str = EXECUTOR_MEMORY,
 ) -> Iterator[Engine]:
     """Yield the engine of a problem that was checked, in double precision; its files are gone at the end.
 
-    - `label`: of the function that asks, for messages. `max_memory` to `workers`: see `solve_tiled`.
+    - `label`: of the function that asks, for messages. `max_memory` to `workers`, `executors`: see
+      `solve_tiled`.
     - `inverse`: whether its inverse is asked for, which takes more memory than steps do.
 
     Raises `JaxbaError` for options out of range, and where memory does not suffice.
@@ -61,4 +65,8 @@ def opened(
         of_tiles = np.bincount(tree.tile_of_point[np.asarray(problem.observations.point_index)])
         work = fronts.bytes_in_inverse() if inverse else fronts.bytes_in_work(int(workers))
         budget = plan_memory(label, problem, fronts, limit, float(of_tiles.max()), int(workers), work)
-        yield Engine(problem, loss, tree, fronts, budget, Path(files), pool, int(workers))
+        elsewhere = None
+        if executors is not None:
+            kept = memory_limit(label, executor_memory, "executor_memory")
+            elsewhere = Elsewhere(label, executors, Path(files).absolute(), kept)
+        yield Engine(problem, loss, tree, fronts, budget, Path(files), pool, int(workers), elsewhere)

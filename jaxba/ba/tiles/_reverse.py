@@ -33,6 +33,7 @@ from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Engine
 from jaxba.ba.tiles._gradient_sums import GradientSums
 from jaxba.ba.tiles._programs import Handed, handed
+from jaxba.ba.tiles._tile_work import Up
 from jaxba.geometry import AbstractLoss, Linear
 
 
@@ -110,21 +111,22 @@ class Reverse:
         """Return H^-1 b over images and tail, before tiles are put back; `rhs` gives each tile's part of b."""
         engine, nothing = self.engine, np.zeros(())
 
-        def hand(number: int) -> Handed:
+        def up(number: int) -> Up:
             engine.models.release(number)
             held = self._held(number)
             engine.models.put(number, held)
             arguments = engine.system(number), held, rhs(number, held)
-            return jax.tree.map(np.asarray, call_compiled(_hand, *arguments))
+            handed: Handed = jax.tree.map(np.asarray, call_compiled(_hand, *arguments))
+            return engine.up_tile(number, handed, nothing)
 
-        up = engine.up(hand, nothing)
+        found = engine.up(engine.each_tile(up), nothing)
         pivots = [np.inf]
         for number, node in enumerate(engine.tree.nodes):
             if len(node.eliminated):
                 root = np.diagonal(engine.factor(number).root) ** 2
-                pivots.append(np.min(root / up.diagonal[node.eliminated].reshape(-1)))
+                pivots.append(np.min(root / found.diagonal[node.eliminated].reshape(-1)))
         count = engine.shape.border
-        corner = np.tril(up.update[:count, :count])
+        corner = np.tril(found.update[:count, :count])
         corner += np.tril(corner, -1).T
         scale = 1 / np.sqrt(np.maximum(np.diagonal(corner), np.finfo(float).tiny))
         try:
@@ -133,7 +135,7 @@ class Reverse:
             raise NotPositive from error
         if min([*pivots, *np.diagonal(root) ** 2]) < SINGULAR:
             raise NotPositive
-        border = scale * np.linalg.solve(corner * scale[:, None] * scale, scale * up.update[count, :count])
+        border = scale * np.linalg.solve(corner * scale[:, None] * scale, scale * found.update[count, :count])
         return engine.put_back_tops(border)
 
     def _step_of_tile(self, number: int, solution: np.ndarray, tail: np.ndarray, rhs: Step, held: _Held) -> Step:

@@ -79,9 +79,14 @@ class Shelf:
             for path, leaf in zip(paths, leaves, strict=True):
                 np.save(path, leaf)
         except OSError as error:
-            size, free = float(sum(leaf.nbytes for leaf in leaves)), float(shutil.disk_usage(folder).free)
-            raise JaxbaError(
-                f"{folder}: {size_text(size)} of a tile could not be written ({error.strerror}); {size_text(free)} are "
-                "free there. Make room, give a folder on another disk, or more memory (max_memory)."
-            ) from error
+            raise cannot_write(folder, sum(leaf.nbytes for leaf in leaves), error) from error
         self._filed[key] = structure, paths
+
+
+def cannot_write(folder: Path, size: int, error: OSError) -> JaxbaError:
+    """Return the error that says that so many bytes of a tile could not be written."""
+    free = float(shutil.disk_usage(folder).free)
+    return JaxbaError(
+        f"{folder}: {size_text(float(size))} of a tile could not be written ({error.strerror}); {size_text(free)} are "
+        "free there. Make room, give a folder on another disk, or more memory (max_memory)."
+    )

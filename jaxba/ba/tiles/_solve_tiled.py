@@ -2,7 +2,8 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxba.ba._solvers import RUNNING, SchurLevenbergMarquardt, require_stops
 from jaxba.ba._system import centred, from_centred, is_traced, own_unknowns
 from jaxba.ba.checks import prepare
 from jaxba.ba.tiles._checkpoint import Checkpoint, Standing
-from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
+from jaxba.ba.tiles._opened import EXECUTOR_MEMORY, TILE_OBSERVATIONS, opened
 from jaxba.ba.tiles._reversible import solve_reversibly
 from jaxba.ba.tiles._step import Stepper
 from jaxba.geometry import AbstractLoss, Linear, check_loss
@@ -37,6 +38,8 @@ def solve_tiled(
     gtol: float = 1e-10,
     callback: Callable[[HistoryStep], None] | None = None,
     on_tile: Callable[[int, int], None] | None = None,
+    executors: Sequence[Executor] | None = None,
+    executor_memory: float | str = EXECUTOR_MEMORY,
 ) -> Solution:
     """Adjust a problem in tiles: the same steps, and the same solution, as `solve` with Levenberg-Marquardt.
 
@@ -52,11 +55,17 @@ def solve_tiled(
       to the same bytes as without a break; it is gone when the solve has ended by itself. In a folder each solve has a
       file of its own, which stays: the same call then finds the solution there.
     - `on_tile`: called with how many tiles of a step are done, each once on the way up and once down, and of how many.
+    - `executors`: of `concurrent.futures`, whose processes work on the tiles in place of threads of this one; they must
+      see `folder`. One a process is best, since each then keeps what it needs of its tiles again: several times
+      `ProcessPoolExecutor(1, get_context("spawn"))`, or `client.get_executor(workers=[address],
+      allow_other_workers=True)` for each worker of dask. A process that is lost costs no more than its work. The bytes
+      of the result are the same by processors of one kind.
+    - `executor_memory`: what each of their processes keeps of tiles, beside the ones in work; the rest lies in files.
 
     Raises `JaxbaError` as `solve` does, and where memory or disk do not suffice.
 
     `jax.grad` goes through it, tile by tile: the derivative is that of `solve`, in reverse mode alone, and not inside
-    `jit` or `vmap`. `max_memory` is planned for steps; the gradient of a tile takes more than its step.
+    `jit` or `vmap`. It is taken in this process. `max_memory` is planned for steps; the gradient of a tile takes more.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(30)
@@ -78,7 +87,8 @@ def solve_tiled(
     }
 
     def on_host(problem: Problem, loss: AbstractLoss) -> Solution:
-        return in_tiles("solve_tiled", problem, loss, solver, max_nfev, callback, checkpoint, room, on_tile)
+        of_steps = {**room, "executors": executors, "executor_memory": executor_memory}
+        return in_tiles("solve_tiled", problem, loss, solver, max_nfev, callback, checkpoint, of_steps, on_tile)
 
     if is_traced((problem, loss)):
         return solve_reversibly(
@@ -110,7 +120,7 @@ def in_tiles(
         start = own_unknowns(near)
         set_up = time.perf_counter()
         stepper = Stepper(engine, solver, on_tile)
-        if standing is None or int(standing.state.status) == RUNNING:
+        if engine.elsewhere is None and (standing is None or int(standing.state.status) == RUNNING):
             stepper.compile(start)
         compiled = time.perf_counter()
         costs = engine.costs(start)

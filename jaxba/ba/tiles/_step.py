@@ -5,8 +5,8 @@ of the sums that the step is judged by, as the solver judges in one piece.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -31,6 +31,8 @@ from jaxba.ba.tiles._engine import Call, Engine
 from jaxba.ba.tiles._programs import Sums, put_back
 from jaxba.geometry import Pose
 
+_T = TypeVar("_T")
+
 
 class Stepper:
     """Takes steps of a solver with an engine; `on_tile`: see `solve_tiled`."""
@@ -51,7 +53,7 @@ class Stepper:
         damping, bend = np.asarray(state.trust), np.asarray(state.bend)
         self._num_done = 0
         try:
-            up = self.engine.up(self.engine.step_equations(unknowns, damping, bend), damping, self._tell_tile)
+            up = self.engine.up(self._told(self.engine.each_part("step_up", unknowns, damping, bend)), damping)
         except NotPositive:
             return unknowns, call_compiled(self._judge, self._numbers, state, jax.tree.map(np.asarray, _NOTHING_TRIED))
         trial, sums, squared_norm = self._down(unknowns, self._border(unknowns, up.update), damping, bend)
@@ -72,10 +74,13 @@ class Stepper:
         judged = call_compiled(self._judge, self._numbers, state, jax.tree.map(np.asarray, tried))
         return (trial if judged.accepted else unknowns), judged
 
-    def _tell_tile(self) -> None:
-        self._num_done += 1
-        if self._on_tile is not None:
-            self._on_tile(self._num_done, 2 * len(self.engine.tiles))
+    def _told(self, of_tiles: Iterator[_T]) -> Iterator[_T]:
+        """Yield what tiles give, and tell that they are done."""
+        for found in of_tiles:
+            self._num_done += 1
+            if self._on_tile is not None:
+                self._on_tile(self._num_done, 2 * len(self.engine.tiles))
+            yield found
 
     def _border(self, unknowns: Unknowns, top: Float[np.ndarray, "tail tail"]) -> Float[np.ndarray, " border"]:
         """Return the border's solution from what the root hands on."""
@@ -104,7 +109,6 @@ class Stepper:
         """Return the unknowns after the step, what it is judged by, and its squared length."""
         solution, tail = self.engine.put_back_tops(border)
         shared = self._shared_step(unknowns, border)
-        work = functools.partial(self._down_tile, unknowns, solution, tail, shared, damping, bend)
         trial = Unknowns(
             Pose(unknowns.poses.quaternion.copy(), unknowns.poses.translation.copy()),
             unknowns.intrinsics + shared.intrinsics,
@@ -112,37 +116,16 @@ class Stepper:
             unknowns.points.copy(),
         )
         totals = Sums(*[np.zeros(()) for _ in Sums._fields])
-        for (tile, _), (part, sums) in zip(self.engine.tiles, self.engine.each_tile(work), strict=True):
+        of_tiles = self.engine.each_part("step_down", unknowns, solution, tail, shared, damping, bend)
+        for (tile, _), (part, sums, images) in zip(self.engine.tiles, self._told(of_tiles), strict=True):
             tile.put(part, trial)
-            self._tell_tile()
+            solution[tile.order] = images
             totals = Sums(*[total + own for total, own in zip(totals, sums, strict=True)])
         if self.engine.shape.own_cameras:
             refined = np.flatnonzero(self.engine.shape.refined)
             trial.intrinsics[self.engine.camera_index[:, None], refined] += solution[:, 6:]
         squared = np.sum(solution**2) + np.sum(shared.intrinsics**2) + np.sum(shared.lever_arm**2) + totals.of_points
         return trial, totals, float(squared)
-
-    def _down_tile(
-        self,
-        unknowns: Unknowns,
-        solution: Float[np.ndarray, "images block"],
-        tail: Float[np.ndarray, " tail"],
-        shared: Step,
-        damping: Float[np.ndarray, ""],
-        bend: Float[np.ndarray, ""],
-        number: int,
-    ) -> tuple[Unknowns, Sums]:
-        tile, _ = self.engine.tiles[number]
-        images = self.engine.put_back_tile(number, solution, tail)
-        system, part = self.engine.system(number), tile.take(unknowns)
-        model = self.engine.equations(number, part, bend)
-        intrinsics = shared.intrinsics
-        if self.engine.shape.own_cameras:
-            intrinsics = np.zeros(part.intrinsics.shape)
-            intrinsics[:, np.flatnonzero(self.engine.shape.refined)] = images[:, 6:]
-        step = Step(images[:, :6], intrinsics, shared.lever_arm, np.zeros_like(part.points))
-        solved = images, tail[: self.engine.shape.border]
-        return jax.tree.map(np.asarray, call_compiled(put_back, system, part, model, *solved, step, damping, bend))
 
     def _shared_step(self, unknowns: Unknowns, border: Float[np.ndarray, " border"]) -> Step:
         """Return the border's step of intrinsics and lever arm, within the bounds."""

@@ -17,12 +17,14 @@ import platform
 import queue
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
+from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.engine._items import Ended, Item, called, late
 from jaxba.engine._versions import installed
 from jaxba.engine._workers import Resources
@@ -35,6 +37,7 @@ except ImportError as error:
 _ANSWER_S = 10.0  # for a scheduler to answer
 _PATIENCE_S = 60.0  # for workers to be there
 _LOOK_S = 0.5
+_KEPT_SHARE, _UNLIMITED = 0.5, 4e9  # of a worker's memory; bytes, where none is said
 _HEAD = 65536  # bytes of a file that tell it from others
 
 
@@ -48,19 +51,59 @@ class _Given(NamedTuple):
 
 
 @contextlib.contextmanager
-def cluster(items: Sequence[Item], resources: Resources) -> Iterator["Cluster"]:
-    """Yield the engine; raise `JaxbaError` where the cluster is not there, or not fit for these items."""
+def cluster(reads: Iterable[Path], resources: Resources) -> Iterator["Cluster"]:
+    """Yield the engine; raise `JaxbaError` where the cluster is not there, or not fit.
+
+    - `reads`: paths that a worker must see.
+    """
     logger = logging.getLogger("distributed")
     level = logger.level
     logger.setLevel(logging.CRITICAL)  # what goes wrong is said here, once
     client = None
     try:
         client = _client(resources)
-        yield Cluster(client, items, resources)
+        yield Cluster(client, reads, resources)
     finally:
         if client is not None:
             client.close()
         logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def crew(resources: Resources, reads: Iterable[Path]) -> Iterator[tuple[list[Executor], float]]:
+    """Yield an executor a thread of each worker, and the bytes that each may keep of what it works on."""
+    with cluster(reads, resources) as engine:
+        workers = engine.workers()
+        least = min(worker["memory_limit"] or _UNLIMITED for worker in workers.values())
+        try:
+            threads = _free(workers, (), alone=False)
+            yield [_OfWorker(engine.client, address) for address in threads], _KEPT_SHARE * least
+        except JaxbaError:
+            engine.workers()  # says so where it is the scheduler, or the last worker, that has gone
+            raise
+
+
+class _OfWorker(Executor):
+    """Gives work to a worker, and to others like it where that one has gone."""
+
+    def __init__(self, client: distributed.Client, address: str) -> None:
+        self._inner = client.get_executor(workers=[address], allow_other_workers=True, pure=False)
+        self._versions = _versions()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Return the future of a call; raise `BrokenExecutor` where the scheduler has gone."""
+        try:
+            return self._inner.submit(_where_alike, self._versions, fn, *args, **kwargs)
+        except (OSError, RuntimeError) as error:
+            raise BrokenExecutor(str(error)) from error
+
+
+def _where_alike(versions: dict[str, str], fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Call in a worker, which may have come after the others were compared."""
+    if other := _difference(versions, _versions()):
+        raise JaxbaError(f"a worker on {platform.node()}: {other}")
+    use_compilation_cache()
+    return fn(*args, **kwargs)
 
 
 class Cluster:
@@ -71,13 +114,13 @@ class Cluster:
 
     more_memory = "raise the --memory-limit of dask worker"
 
-    def __init__(self, client: distributed.Client, items: Sequence[Item], resources: Resources) -> None:
-        self._client, self._resources = client, resources
-        self._reads = sorted({path for item in items for path in item.reads})
+    def __init__(self, client: distributed.Client, reads: Iterable[Path], resources: Resources) -> None:
+        self.client, self._resources = client, resources
+        self._reads = sorted(set(reads))
         self._alike: set[str] = set()
         self._stuck: set[str] = set()
         self._ending: queue.SimpleQueue[distributed.Future] = queue.SimpleQueue()
-        workers = self._workers()
+        workers = self.workers()
         self.count = sum(worker["nthreads"] for worker in workers.values())
         self.memory_bytes = max(worker["memory_limit"] or float("inf") for worker in workers.values())
 
@@ -88,15 +131,15 @@ class Cluster:
         waiting, given = deque(items), dict[distributed.Future, _Given]()
         try:
             while waiting or given:
-                workers = self._workers()
+                workers = self.workers()
                 for future, one in list(given.items()):
                     if (ended := self._given_up(one, workers)) is not None:
-                        self._client.cancel([future])
+                        self.client.cancel([future])
                         del given[future]
                         yield one.item, ended
                 for address in _free(workers, given.values(), alone=alone)[: len(waiting)]:
                     item = waiting.popleft()
-                    future = self._client.submit(called, call, item.arguments, workers=[address], pure=False, retries=0)
+                    future = self.client.submit(called, call, item.arguments, workers=[address], pure=False, retries=0)
                     future.add_done_callback(self._ending.put)
                     given[future] = _Given(item, address, time.monotonic(), self._resources.seconds_for(item.effort))
                 for future in self._done(given):
@@ -104,7 +147,7 @@ class Cluster:
                     yield one.item, _ended(future, one)
         finally:
             with contextlib.suppress(Exception):  # a client that has lost its scheduler cannot
-                self._client.cancel(list(given))
+                self.client.cancel(list(given))
 
     def _done(self, given: dict[distributed.Future, _Given]) -> list[distributed.Future]:
         """Return those that have ended, after a while where none has."""
@@ -122,12 +165,12 @@ class Cluster:
         if time.monotonic() - one.begun_s <= one.seconds:
             return None
         try:
-            self._client.restart_workers([one.address], timeout=_PATIENCE_S, raise_for_error=False)
+            self.client.restart_workers([one.address], timeout=_PATIENCE_S, raise_for_error=False)
         except ValueError:  # it has no nanny: its thread works on, and gets nothing any more
             self._stuck.add(one.address)
         return late(one.seconds)
 
-    def _workers(self) -> dict[str, Any]:
+    def workers(self) -> dict[str, Any]:
         """Return what the scheduler says of the workers that may be given items, by address; wait where there is none.
 
         Raises `JaxbaError` where none comes, or the scheduler has gone, or a worker is unlike this process.
@@ -135,7 +178,9 @@ class Cluster:
         begun_s = time.monotonic()
         while True:
             try:
-                found = dict(self._client.scheduler_info(n_workers=-1)["workers"])
+                found = dict(self.client.scheduler_info(n_workers=-1)["workers"])
+                if self.client.status == "closed":  # it has tried to come back to the scheduler
+                    raise OSError
             except (OSError, TimeoutError, RuntimeError, KeyError) as error:  # what it says of itself is empty then
                 raise JaxbaError(
                     f"{self._where}: the scheduler no longer answers. What is done is kept; start it again with its "
@@ -163,7 +208,7 @@ class Cluster:
         Raises `JaxbaError` for one that is not.
         """
         here = _about([str(path.absolute()) for path in self._reads])
-        found: Any = self._client.run(_about, list(here.seen), workers=addresses, on_error="return")
+        found: Any = self.client.run(_about, list(here.seen), workers=addresses, on_error="return")
         for address, there in sorted(found.items()):
             if isinstance(there, OSError):  # it has just gone, and is asked again if it comes back
                 continue
@@ -172,13 +217,8 @@ class Cluster:
                     f"worker {address}: jaxba cannot be used there ({type(there).__name__}: {there}). Install the same "
                     "environment on all machines."
                 )
-            for name in sorted(here.versions.keys() | there.versions.keys()):
-                own, other = here.versions.get(name, "none"), there.versions.get(name, "none")
-                if own != other:
-                    raise JaxbaError(
-                        f"worker {address} on {there.host}: it has {name} {other}, and this process has {own}; results "
-                        "would differ by the worker. Install the same versions on all machines (requirements.lock)."
-                    )
+            if other := _difference(here.versions, there.versions):
+                raise JaxbaError(f"worker {address} on {there.host}: {other}")
             for path, content in here.seen.items():
                 if there.seen[path] != content:
                     raise JaxbaError(
@@ -197,9 +237,23 @@ class _About(NamedTuple):
 
 
 def _about(paths: list[str]) -> _About:
-    return _About(
-        platform.node(), {**installed(), "Python": platform.python_version(), "jaxba": _source()}, _seen(paths)
-    )
+    return _About(platform.node(), _versions(), _seen(paths))
+
+
+def _versions() -> dict[str, str]:
+    return {**installed(), "Python": platform.python_version(), "jaxba": _source()}
+
+
+def _difference(here: dict[str, str], there: dict[str, str]) -> str | None:
+    """Return in words how the versions of a worker differ from those here; None where they do not."""
+    for name in sorted(here.keys() | there.keys()):
+        own, other = here.get(name, "none"), there.get(name, "none")
+        if own != other:
+            return (
+                f"it has {name} {other}, and this process has {own}; results would differ by the worker. Install the "
+                "same versions on all machines (requirements.lock)."
+            )
+    return None
 
 
 @functools.cache

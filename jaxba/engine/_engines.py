@@ -4,11 +4,15 @@ An engine gives items to workers and says how each ended. Here stands what is th
 has the memory for is named, and one whose worker died, or had not memory enough, is tried once more when the others are
 done, with no other beside it: what the machine lacked is there then, and who was only in the way of another is no
 victim.
+
+What a stage that does all photos at once gives away of its work, it gives to the executors of a crew.
 """
 
 import contextlib
 from collections.abc import Callable, Generator, Iterator, Sequence
-from typing import Any, Protocol
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
 from jaxba.engine._items import Ended, Item, in_gb, reason_of, too_large
 from jaxba.engine._pool import LocalWorkers
@@ -33,6 +37,30 @@ class Engine(Protocol):
     ) -> Iterator[tuple[Item, Ended]]:
         """Yield how each item ended, as they do; one at a time where they are to be `alone`."""
         ...
+
+
+class Crew(NamedTuple):
+    """Executors, one a worker's thread, and the bytes that each may keep of what it works on."""
+
+    executors: Sequence[Executor]
+    memory_bytes: float
+
+
+@contextlib.contextmanager
+def crew(resources: Resources, reads: Sequence[Path]) -> Iterator[Crew | None]:
+    """Yield the crew of a cluster; None where this machine does the work, in threads of this process.
+
+    - `reads`: paths that a worker must see.
+
+    Raises `JaxbaError` as `work` does.
+    """
+    if not resources.is_cluster:
+        yield None
+        return
+    from jaxba.engine import _cluster
+
+    with _cluster.crew(resources, reads) as (executors, memory_bytes):
+        yield Crew(executors, memory_bytes)
 
 
 def work(
@@ -84,5 +112,5 @@ def _engine(items: Sequence[Item], resources: Resources) -> Iterator[Engine]:
         return
     from jaxba.engine._cluster import cluster  # an extra, and slow to import
 
-    with cluster(items, resources) as engine:
+    with cluster((path for item in items for path in item.reads), resources) as engine:
         yield engine

@@ -17,7 +17,7 @@ from typing import Any
 from jaxba._atomic import write_folder_atomically
 from jaxba._errors import JaxbaError
 from jaxba.engine import _store
-from jaxba.engine._engines import fewer_workers, work as work_on
+from jaxba.engine._engines import crew, fewer_workers, work as work_on
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.engine._items import Item
 from jaxba.engine._limits import check_failures
@@ -131,13 +131,13 @@ def _run_stage(
     waiting = [item for item in items if why_to_do(project, stage, item, params)]
     if waiting:
         tell(Event("todo", stage.name, 0, len(waiting), by_photos=stage.is_by_photo))
+    reads = holder_file(project.folder), *{file.path.parent: file.path for file in done.files}.values()
     if not stage.is_by_photo:
         for item in waiting:
-            _run_whole(project, stage, item, params, resources)
+            _run_whole(project, stage, item, params, resources, reads)
         return collected(stage, done, items)[0], len(waiting), (), ()
     if waiting:
         stage.refuse(project.stage(stage.name), items, params, resources)
-    reads = holder_file(project.folder), *{file.path.parent: file.path for file in done.files}.values()
     failed, notes = _run_photos(stage, items, waiting, params, resources, reads, tell)
     by_name = {left.name: left for left in (*failed, *failures(items))}
     unused = tuple(by_name[name] for name in sorted(by_name))
@@ -148,12 +148,15 @@ def _run_stage(
     return collected(stage, done, items)[0], len(waiting), unused, notes
 
 
-def _run_whole(project: Project, stage: Stage, item: Work, params: Parameters, resources: Resources) -> None:
+def _run_whole(
+    project: Project, stage: Stage, item: Work, params: Parameters, resources: Resources, reads: tuple[Path, ...]
+) -> None:
     if stage.writes_files:
         with write_folder_atomically(project.export) as partial:
             outputs = stage.module.run(replace(item.inputs, folder=partial), params)
     elif stage.takes_room:
-        room = Room(resources.memory_bytes, project.unfinished(stage.name, fingerprint(item.key)))
+        folder = project.unfinished(stage.name, fingerprint(item.key))
+        room = Room(resources.memory_bytes, folder, functools.partial(crew, resources, reads))
         outputs = stage.module.run(item.inputs, params, room)
     else:
         outputs = stage.module.run(item.inputs, params)

@@ -131,7 +131,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
     reference, photos = inputs.reference, inputs.photos
     tiling = sfm.Tiling(chunk_size=inputs.chunk_size or inputs.block.num_images)
     if room is not None:
-        tiling = dataclasses.replace(tiling, max_memory=room.memory_bytes, checkpoint=room.folder)
+        tiling = dataclasses.replace(tiling, max_memory=room.memory_bytes, folder=room.folder, crew=room.crew)
     adjusted = sfm.adjust(
         inputs.block,
         inputs.tracks,

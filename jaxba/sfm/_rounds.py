@@ -4,11 +4,14 @@
 block is solved in tiles, to the same answer, in as much memory as it is given (`Tiling`).
 """
 
+import contextlib
 import dataclasses
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -59,14 +62,17 @@ class Tiling:
 
     - `chunk_size`: a block of more images is solved in tiles, at least as many as it has chunks of this size.
     - `max_observations`: a block of more is solved in tiles as well. `max_memory`: as in `solve_tiled`.
-    - `checkpoint`: a folder in which solves in tiles keep where they stand: rounds that were broken off go through it
-      again, to the same bytes as without a break.
+    - `folder`: in which solves in tiles keep where they stand, and what does not fit in memory: rounds that were broken
+      off go through it again, to the same bytes as without a break.
+    - `crew`: opens executors that work on tiles in place of this process, and see the folder, with the bytes that each
+      may keep; None where none do.
     """
 
     chunk_size: int = 500
     max_observations: int = 1_000_000  # 2.1 GB in one piece, and slower there
     max_memory: float | str | None = None
-    checkpoint: Path | None = None
+    folder: Path | None = None
+    crew: Callable[[], AbstractContextManager[tuple[Sequence[Executor], float] | None]] = contextlib.nullcontext
 
     def applies(self, block: Block, tracks: Tracks) -> bool:
         """Return whether the block is solved in tiles."""
@@ -146,10 +152,14 @@ class Rounds:
             tiles: dict[str, Any] = {
                 "num_tiles": math.ceil(block.num_images / self.tiling.chunk_size),
                 "max_memory": self.tiling.max_memory,
-                "checkpoint": self.tiling.checkpoint,
+                "folder": self.tiling.folder,
+                "checkpoint": self.tiling.folder,
             }
             told = _Told(number)
-            solution = solve_tiled(problem, loss=loss, callback=told.step, on_tile=told.tile, **tiles, **stops)
+            with self.tiling.crew() as crew:
+                if crew is not None:
+                    tiles |= {"executors": crew[0], "executor_memory": crew[1]}
+                solution = solve_tiled(problem, loss=loss, callback=told.step, on_tile=told.tile, **tiles, **stops)
         else:
             solution = solve(problem, loss=loss, plan=make_plan(problem, like=shape), **stops)
         if solution.result == "interrupted":

@@ -7,20 +7,23 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import distributed
 import psutil
 import pytest
-from small_survey import Survey
+from small_survey import FAST, Survey
 from worker_calls import double, double_slowly, killed_once
 
+import jaxba
 from jaxba import JaxbaError
-from jaxba.engine import Resources, _cluster
-from jaxba.engine._engines import work
+from jaxba.engine import Resources, _cluster, changed
+from jaxba.engine._engines import crew, work
 from jaxba.engine._items import Item
+from jaxba.pipeline import PIPELINE, Event, Run, run_pipeline
+from jaxba.sfm import _rounds
 
 ROOT = Path(__file__).parents[2]
 
@@ -157,24 +160,77 @@ def test_a_scheduler_that_goes_or_has_no_worker_is_named(tmp_path: Path, monkeyp
                 list(ending)
 
 
+def test_a_crew_works_where_it_is_alike(scheduler: Path, monkeypatch: pytest.MonkeyPatch):
+    with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
+        assert found is not None and len(found.executors) == 2 and 1e8 < found.memory_bytes < 1e12
+        assert [executor.submit(double, k).result() for k, executor in enumerate(found.executors)] == [0, 2]
+        monkeypatch.setattr(_cluster, "_versions", lambda: {"jaxba": "0"})
+        with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
+            executor = _cluster._OfWorker(client, "tcp://127.0.0.1:9")  # which is not there: another one does it
+            future = executor.submit(double, 1)
+            assert isinstance(future.exception(30), JaxbaError)
+        with pytest.raises(JaxbaError, match=r"a worker on .*: it has .*, and this process has .*; results would"):
+            future.result()
+    with crew(Resources(), ()) as none:
+        assert none is None
+
+
+def test_tiles_whose_scheduler_goes_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(_cluster, "_ANSWER_S", 3.0)
+    problem = jaxba.synthetic.uav_block(60, side_overlap=0.7, points_per_image=40.0).problem
+
+    def go(done: int, total: int) -> None:
+        process.kill()
+        process.wait()
+
+    with scheduler_in(tmp_path) as (file, process), workers(file, 1):
+        resources = Resources(scheduler_file=str(file))
+        with (
+            pytest.raises(JaxbaError, match=r"scheduler no longer answers\. What is done is kept; start it again"),
+            crew(resources, ()) as found,
+        ):
+            assert found is not None
+            monkeypatch.setattr(_cluster, "_PATIENCE_S", 10.0)
+            jaxba.solve_tiled(problem, num_tiles=4, executors=found.executors, folder=tmp_path, on_tile=go)
+
+
 @pytest.mark.slow
 def test_a_run_on_a_cluster_makes_the_same_bytes_though_workers_are_killed(
-    scheduler: Path, made: Survey, photos: Path, tmp_path: Path
+    scheduler: Path, made: Survey, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     killed: set[int] = set()
 
-    def kill_one(event: Any) -> None:
+    def kill() -> None:
+        with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
+            pid = min(client.run(os.getpid).values())
+        os.kill(pid, signal.SIGKILL)
+        killed.add(pid)
+
+    def kill_in_stage(event: Any) -> None:
         """Kill a worker in the middle of features, and one in the middle of matching."""
         if event.kind == "photo" and event.done == 2:
-            with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
-                pid = min(client.run(os.getpid).values())
-            os.kill(pid, signal.SIGKILL)
-            killed.add(pid)
+            kill()
 
+    def in_tiles(survey: Survey, *changes: str, tell: Callable[[Event], None] = lambda event: None) -> Run:
+        """Run with tiles of three photos, which are fewer than may be asked for."""
+        settings = changed(PIPELINE.settings, [*FAST, "workers.workers=1", *changes])
+        monkeypatch.setitem(vars(settings["tiles"]), "chunk_size", 3)
+        return run_pipeline(survey.photos, survey.project, settings, tell=tell)
+
+    alone = made.copy(tmp_path / "alone")
+    assert in_tiles(alone).stages_run == ("adjust", "export")
+    tile = _rounds._Told.tile
+
+    def kill_in_tile(told: _rounds._Told, done: int, total: int) -> None:
+        tile(told, done, total)
+        if (told.round, told.num_steps, done, total) == (2, 1, 4, 6):
+            kill()
+
+    monkeypatch.setattr(_rounds._Told, "tile", kill_in_tile)
     own = Survey(photos, tmp_path / "project")
-    run = own.run(f"workers.scheduler_file={scheduler}", tell=kill_one)
-    assert len(killed) == 2 and not run.facts["left_out"]
-    names = sorted(path.relative_to(made.project) for path in (made.project / "export").rglob("*") if path.is_file())
+    run = in_tiles(own, f"workers.scheduler_file={scheduler}", tell=kill_in_stage)
+    assert len(killed) == 3 and not run.facts["left_out"]
+    names = sorted(path.relative_to(alone.project) for path in (alone.project / "export").rglob("*") if path.is_file())
     assert names
     for name in names:
-        assert (own.project / name).read_bytes() == (made.project / name).read_bytes(), name
+        assert (own.project / name).read_bytes() == (alone.project / name).read_bytes(), name

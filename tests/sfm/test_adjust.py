@@ -213,7 +213,7 @@ def test_rounds_that_were_stopped_go_on_to_the_same_bytes(
         monkeypatch.setattr(_rounds._Told, "step", step)
         found.append(None)
         with contextlib.suppress(KeyboardInterrupt):
-            found[-1] = _run(clean, replace(IN_TILES, checkpoint=tmp_path if stop_at or len(found) > 1 else None))
+            found[-1] = _run(clean, replace(IN_TILES, folder=tmp_path if stop_at or len(found) > 1 else None))
         monkeypatch.setattr(_rounds._Told, "step", plain)
         return steps
 

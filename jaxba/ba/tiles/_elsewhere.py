@@ -13,7 +13,7 @@ import platform
 import threading
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +103,7 @@ class Elsewhere:
         while True:
             try:
                 return future.result()
-            except BrokenExecutor:
+            except (BrokenExecutor, CancelledError):
                 if executor in self._executors:
                     self._executors.remove(executor)
                 future, executor, call = self._given(name, call)

@@ -136,7 +136,9 @@ def adjust(
         medians.append(float(np.median(solved.error_px)))
         settled = len(medians) > 2 and abs(medians[-1] - medians[-2]) <= _CONVERGED * medians[-2]
         if settled and not to_the_end:
-            solved = solve(solved.block, max_nfev=settings.max_nfev, ftol=settings.ftol)
+            block = solved.block
+            del solved
+            solved = solve(block, max_nfev=settings.max_nfev, ftol=settings.ftol)
             medians[-1] = float(np.median(solved.error_px))
         block = solved.block
         _log.info("round %d, median %.2f px", len(medians), medians[-1])
@@ -160,9 +162,11 @@ def adjust(
                 matches = matches.select(~gone[matches.edge])
                 found = triangulate_tracks(block, tracks, settings.min_angle_rad, limit_px, by_redundancy=True)
         block = apply_points(block, tracks, found)
+        del solved  # the next solve has its memory
         judged = found.is_point[found.of_track] | (used_in_track(found) < 2)
         num_judged = int(judged.sum())
         std_px = estimate_std(found, limit_px, block)
+        del found, judged
         weak = np.bincount(block.observation_image, minlength=block.num_images) < _LEAST_OBSERVATIONS
         if weak.any():
             lost += [_lost(photos[i].name) for i in block.image_index[weak]]

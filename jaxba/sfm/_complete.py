@@ -9,8 +9,8 @@ A found feature's descriptor must be as near to one of the track's as the featur
 the limit is the 90% quantile of their distances. Whether the found observations fit is for the adjustment to judge,
 like that of all others.
 
-Cost: a turn for each point and image, 10 ns, and a projection and a search in a k-d tree for each point that an image
-looks towards; the features of as many images as there are cores are open at a time.
+Cost: a projection and a search in a k-d tree for each point that an image looks towards (see `_views.py`); the features
+of as many images as there are cores are open at a time.
 """
 
 import dataclasses
@@ -21,13 +21,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
-from jaxba.ba import project_in_cameras
-from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Features, Photo, Tracks
 from jaxba.sfm._cores import on_all_cores
-from jaxba.sfm._rays import make_rays
+from jaxba.sfm._views import Views
 
 _NEAREST = 4  # features that compete for a point
 _QUANTILE = 0.9
@@ -57,12 +54,13 @@ def complete_tracks(
     known = _Known.of(block, tracks, features)
     if known is None:
         return tracks
-    cos_view = _cos_of_view(block, photos)
+    views = Views(block, photos)
+    by_image = np.argsort(tracks.image_index, kind="stable")
+    ends = np.searchsorted(tracks.image_index, block.image_index, side="right", sorter=by_image)
+    starts = np.searchsorted(tracks.image_index, block.image_index, sorter=by_image)
 
     def links_in(row: int) -> _Links:
-        return _links_in(
-            row, block, tracks, features, photos, known, radius_px, float(cos_view[block.camera_index[row]])
-        )
+        return _links_in(row, by_image[starts[row] : ends[row]], block, tracks, features, known, views, radius_px)
 
     links = on_all_cores(links_in, range(block.num_images))
     columns = [np.concatenate([getattr(part, name) for part in links]) for name in _Links.__dataclass_fields__]
@@ -108,18 +106,20 @@ class _Known:
 
 def _links_in(
     row: int,
+    in_image: Int[np.ndarray, " seen"],
     block: Block,
     tracks: Tracks,
     features: Mapping[int, Features],
-    photos: tuple[Photo, ...],
     known: _Known,
+    views: Views,
     radius_px: float,
-    cos_view: float,
 ) -> _Links:
-    """Return the features of one image that points which it does not see yet have found."""
+    """Return the features of one image that points which it does not see yet have found.
+
+    - `in_image`: its rows in the tracks.
+    """
     image = int(block.image_index[row])
     found = features[image]
-    in_image = np.flatnonzero(tracks.image_index == image)
     owner = np.full(found.num_keypoints, -1)
     described = in_image[tracks.feature_index[in_image] < found.num_keypoints]
     owner[tracks.feature_index[described]] = tracks.track_index[described]
@@ -129,13 +129,10 @@ def _links_in(
     np.maximum.at(of_place, place, owner)
     owner = of_place[place]
 
-    sees = np.zeros(tracks.num_tracks, bool)
-    sees[tracks.track_index[in_image]] = True
-    points = np.flatnonzero(~sees[block.track_index] & known.is_described)
-    points, pixel = _pixels(block, row, points, cos_view)
-    size = np.array([photos[image].width_px, photos[image].height_px])
-    inside = np.isfinite(pixel).all(axis=1) & ((pixel >= 0) & (pixel <= size)).all(axis=1)
-    points, pixel = points[inside], pixel[inside]
+    points = views.towards(row)
+    points = points[known.is_described[points]]
+    points = points[~np.isin(block.track_index[points], tracks.track_index[in_image])]
+    points, pixel = views.pixels(row, points)
     nothing = np.zeros(0, np.int64)
     if not len(points) or not found.num_keypoints:
         return _Links(nothing, nothing, nothing, nothing, np.zeros(0), np.zeros((0, 2)))
@@ -197,34 +194,6 @@ def _joined(tracks: Tracks, links: _Links) -> Tracks:
         xy_px=np.concatenate([tracks.xy_px, links.xy_px[added]])[order],
         rgb=tracks.rgb[kept],
     )
-
-
-def _cos_of_view(block: Block, photos: tuple[Photo, ...]) -> Float[np.ndarray, " cameras"]:
-    """Return the cosine of the angle from each camera's axis beyond which its images see nothing; -1 where unknown."""
-    found = np.full(len(block.camera_parameters), -1.0)
-    along = np.linspace(0.0, 1.0, _BORDER)
-    ends = np.zeros_like(along), np.ones_like(along)
-    border = np.concatenate([np.stack(side, axis=1) for end in ends for side in ((along, end), (end, along))])
-    for camera in np.unique(block.camera_index):
-        row = int(np.flatnonzero(block.camera_index == camera)[0])
-        photo = photos[block.image_index[row]]
-        rays = make_rays(block, np.full(len(border), row), border * [photo.width_px, photo.height_px])
-        axis = Rotation.from_quat(block.quaternion[row], scalar_first=True).as_matrix()[2]
-        angle = np.arccos(np.clip(axis @ rays.direction, -1.0, 1.0)).max()
-        found[camera] = np.cos(min(_MARGIN * angle, np.pi)) if np.isfinite(angle) else -1.0
-    return found
-
-
-def _pixels(
-    block: Block, row: int, points: Int[np.ndarray, " points"], cos_view: float
-) -> tuple[Int[np.ndarray, " seen"], Float[np.ndarray, "seen 2"]]:
-    """Return which of the points an image looks towards, before the camera, and where they fall in it."""
-    rotation = Rotation.from_quat(block.quaternion[row], scalar_first=True).as_matrix()
-    in_cam = rotation @ block.points_m[points].T + block.translation_m[row][:, None]
-    ahead = (in_cam[2] > 0) & (in_cam[2] >= cos_view * np.sqrt(np.einsum("kn,kn->n", in_cam, in_cam)))
-    points, in_cam = points[ahead], in_cam[:, ahead]
-    camera = CAMERAS[block.camera_model](*block.camera_parameters.T)
-    return points, project_in_cameras(camera, np.full(len(points), block.camera_index[row]), in_cam).T
 
 
 def _distances(

@@ -43,15 +43,17 @@ class MatchRows:
 
 def match_rows(view_graph: ViewGraph, tracks: Tracks) -> MatchRows:
     """Return the matches as rows of the tracks."""
-    edge = np.repeat(np.arange(len(view_graph.pairs)), view_graph.num_inliers)
+    edge = np.repeat(np.arange(len(view_graph.pairs), dtype=np.int32), view_graph.num_inliers)
     size = 1 + max(tracks.feature_index.max(initial=0), view_graph.matches.max(initial=0))
     key = tracks.image_index.astype(np.int64) * size + tracks.feature_index
-    order = np.argsort(key, kind="stable")
-    rows = []
+    order = np.argsort(key, kind="stable").astype(np.int32)
+    key, rows = key[order], []
     for side in range(2):
         wanted = view_graph.pairs[edge, side].astype(np.int64) * size + view_graph.matches[:, side]
-        place = np.minimum(np.searchsorted(key[order], wanted), max(len(key) - 1, 0))
-        rows.append(np.where(key[order][place] == wanted, order[place], -1) if len(key) else np.full(len(edge), -1))
+        place = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
+        rows.append(
+            np.where(key[place] == wanted, order[place], np.int32(-1)) if len(key) else np.full(len(edge), -1, np.int32)
+        )
     inside = (rows[0] >= 0) & (rows[1] >= 0)
     inside[inside] = tracks.track_index[rows[0][inside]] == tracks.track_index[rows[1][inside]]
     return MatchRows(edge[inside], rows[0][inside], rows[1][inside])
@@ -64,8 +66,8 @@ def edge_medians_px(
 
     - `found`: of the block's images and the tracks.
     """
-    place = np.full(tracks.num_observations, -1)
-    place[found.row] = np.arange(len(found.row))
+    place = np.full(tracks.num_observations, -1, np.int32)
+    place[found.row] = np.arange(len(found.row), dtype=np.int32)
     first, second = place[matches.first], place[matches.second]
     both = (first >= 0) & (second >= 0)
     edge, first, second = matches.edge[both], first[both], second[both]
@@ -131,8 +133,8 @@ def without_edges(tracks: Tracks, matches: MatchRows, pruned: Bool[np.ndarray, "
     rgb = np.empty((len(first_row), 3), np.uint8)
     rgb[rank] = tracks.rgb[tracks.track_index[kept[first_row]]]
     rows = kept[order]
-    moved = np.full(count, -1)
-    moved[rows] = np.arange(len(rows))
+    moved = np.full(count, -1, np.int32)
+    moved[rows] = np.arange(len(rows), dtype=np.int32)
     changed = dataclasses.replace(
         tracks,
         track_index=new_index[order],

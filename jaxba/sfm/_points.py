@@ -83,7 +83,7 @@ def with_points(block: Block, tracks: Tracks, *, min_angle_rad: float, max_error
 
 def apply_points(block: Block, tracks: Tracks, found: Triangulated) -> Block:
     """Return the block with these points and the observations that fit them."""
-    number = np.cumsum(found.is_point) - 1
+    number = np.cumsum(found.is_point, dtype=np.int32) - 1
     keep = found.is_used & found.is_point[found.of_track]
     index = found.track_index[found.is_point]
     return dataclasses.replace(
@@ -153,13 +153,13 @@ def redundancy_root(views: Int[np.ndarray, " tracks"]) -> Float[np.ndarray, " tr
 def track_rows(block: Block, tracks: Tracks) -> tuple[Int[np.ndarray, " rows"], ...]:
     """Return rows of tracks that two or more registered images see, their image rows, tracks and track indices."""
     size = max(block.image_index.max(initial=-1), tracks.image_index.max(initial=-1)) + 1
-    row_of_image = np.full(size, -1, np.int64)
+    row_of_image = np.full(size, -1, np.int32)
     row_of_image[block.image_index] = np.arange(block.num_images)
     image_row = row_of_image[tracks.image_index]
     times = np.bincount(tracks.track_index[image_row >= 0], minlength=tracks.num_tracks)
-    row = np.flatnonzero((image_row >= 0) & (times[tracks.track_index] >= 2))
+    row = np.flatnonzero((image_row >= 0) & (times[tracks.track_index] >= 2)).astype(np.int32)
     track_index, of_track = np.unique(tracks.track_index[row], return_inverse=True)
-    return row, image_row[row], of_track, track_index.astype(np.int64)
+    return row, image_row[row], of_track.astype(np.int32), track_index.astype(np.int64)
 
 
 @dataclasses.dataclass(frozen=True)

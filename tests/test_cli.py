@@ -438,3 +438,16 @@ def test_gradcheck_refuses_a_block_without_gauge(cli: Cli, tmp_path: Path):
 
 def small_survey(**options: object) -> jaxba.synthetic.Survey:
     return jaxba.synthetic.uav_block(4, seed=1, camera=jaxba.SimplePinhole(3600.0, 2736.0, 1824.0), **options)
+
+
+def test_a_solve_computes_on_the_device_that_it_is_told(cli: Cli, tile: Path):
+    # breaks where --device is not heeded, or ends in jax's own error
+    try:
+        assert cli("solve", str(tile), "--max-nfev", "2", "--device", "cpu")[0] in (0, 1)
+        with jax.enable_x64(True):
+            assert jax.config.jax_default_device == jax.devices("cpu")[0]  # pyright: ignore[reportAttributeAccessIssue]
+        if jax.default_backend() == "cpu":
+            code, _, err = cli("solve", str(tile), "--device", "gpu")
+            assert code == 2 and "--device gpu: jax sees no such device here (" in err and "jax[cuda12]" in err
+    finally:
+        jax.config.update("jax_default_device", None)

@@ -53,22 +53,30 @@ def compile_ahead(function: Callable[..., Any], *arguments: Any) -> Callable[...
     """Return what `call_compiled` calls for arguments of these shapes, which may be `jax.ShapeDtypeStruct`s."""
     leaves, structure = jax.tree.flatten(arguments)
     shapes = tuple((jax.numpy.shape(leaf), jax.numpy.result_type(leaf).name) for leaf in leaves)
-    return _ahead(function, structure, shapes)
+    return _ahead(function, structure, shapes, platform())
 
 
 @functools.lru_cache(maxsize=64)
 def _ahead(
-    function: Callable[..., Any], structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]
+    function: Callable[..., Any], structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...], _: str
 ) -> Callable[..., Any]:
     arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
     return jax.jit(function).lower(*arguments).compile(compiler_options=compiler_options())
 
 
-@functools.cache
+def platform() -> str:
+    """Return where programs run: `cpu`, `gpu` or another name of jax's; see `jax_default_device`."""
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.default_backend() if device is None else getattr(device, "platform", str(device))
+
+
 def compiler_options() -> dict[str, Any]:
     """Return the options for `compile` and `jit`; none off the CPU, or where this XLA does not know one of them."""
-    if jax.default_backend() != "cpu":
-        return {}
+    return _options_of_cpu() if platform() == "cpu" else {}
+
+
+@functools.cache
+def _options_of_cpu() -> dict[str, Any]:
     probe = jax.jit(lambda x: x + 1).lower(jax.ShapeDtypeStruct((), np.float32))
     try:
         probe.compile(compiler_options=_FAST)

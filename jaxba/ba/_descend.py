@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxba._errors import JaxbaError
 from jaxba._sizes import free_memory, size_text
-from jaxba.ba._compiler import compiler_options
+from jaxba.ba._compiler import compiler_options, platform
 from jaxba.ba._linearise import cost
 from jaxba.ba._solution import HistoryStep
 from jaxba.ba._solvers import RUNNING, AbstractSchurSolver, State, take_numbers
@@ -69,7 +69,7 @@ def descend(
 
 def _require_memory(need: float) -> None:
     """Raise `JaxbaError` where a step needs more memory than is free, in place of XLA's own error."""
-    if need < _SURELY_FREE or jax.default_backend() != "cpu":
+    if need < _SURELY_FREE or platform() != "cpu":
         return
     free = free_memory()
     if need > free:
@@ -131,12 +131,14 @@ def compiled(solver: AbstractSchurSolver, unknowns: Unknowns, system: System, pl
     numbers, rest = take_numbers(solver, unknowns.points.dtype)
     leaves, structure = jax.tree.flatten((numbers, unknowns, system, plain))
     shapes = tuple((leaf.shape, leaf.dtype.name) for leaf in leaves)
-    run = _compile(rest, structure, shapes)
+    run = _compile(rest, structure, shapes, platform())
     return run._replace(init=functools.partial(run.init, numbers), step=functools.partial(run.step, numbers))
 
 
 @functools.lru_cache(maxsize=_KEPT)
-def _compile(rest: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...]) -> Compiled:
+def _compile(
+    rest: AbstractSchurSolver, structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...], _: str
+) -> Compiled:
     """Return the functions; `init` and `step` take the solver's numbers first."""
     arguments = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
     numbers, unknowns, system, plain = jax.tree.unflatten(structure, arguments)

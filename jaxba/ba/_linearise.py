@@ -29,6 +29,7 @@ from jaxba.ba._priors import (
     robust_rows,
     transpose_product,
 )
+from jaxba.ba._products import run_products
 from jaxba.ba._reweighting import reweighting
 from jaxba.ba._rows import rows_of, segments, sum_components
 from jaxba.ba._system import System
@@ -133,7 +134,7 @@ def linearise(system: System, unknowns: Unknowns, bend: Float[Array, ""] | float
         rows = _masked_columns(rows, part, system)
         by_lane = jnp.swapaxes(rows, 2, 3)
         flat = by_lane.reshape(by_lane.shape[0], 2 * ROW_RUN, -1)[:, :, :first_point]
-        of_images = jnp.einsum("rka,rkb->rab", flat, flat)
+        of_images = run_products(flat, flat)
         pixel = jnp.moveaxis(by_lane, 1, 2).reshape(-1, 2, by_lane.shape[-1])
         of_points = (
             pixel[:, 0, first_point:, None] * pixel[:, 0, None] + pixel[:, 1, first_point:, None] * pixel[:, 1, None]

@@ -26,6 +26,7 @@ from jaxtyping import Float
 from jaxba.ba._linearise import Linearisation, refined_columns, sum_cameras, sum_runs, w_product
 from jaxba.ba._plan import ROW_RUN
 from jaxba.ba._priors import PriorBlocks
+from jaxba.ba._products import run_products
 from jaxba.ba._rows import rows_of, segments
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step
@@ -181,7 +182,7 @@ def _eliminate_rows(
         z = apply_root(at_rows[:, :6], w)
         shared = at_rows[:, 6:].reshape(rows, 3, z_shared.shape[-1])
         left, right = (a.reshape(-1, 3 * ROW_RUN, a.shape[-1]) for a in (z, jnp.concatenate([z, shared], axis=-1)))
-        return None, (z, jnp.einsum("rka,rkb->rab", left, right))
+        return None, (z, run_products(left, right))
 
     point_index = jnp.asarray(system.reprojection.point_index).reshape(-1, rows)
     _, (z, products) = jax.lax.scan(chunk, None, (w.reshape(-1, rows, *w.shape[1:]), point_index))
@@ -228,7 +229,7 @@ def _sum_pairs(system: System, z: Float[Array, "rows 3 block"]) -> Float[Array, 
     def chunk(total: Array, fields: tuple[Array, Array, Array]) -> tuple[Array, None]:
         *pairs, block = fields
         first, second = (rows_of(z, p).reshape(p.shape[0], -1, shape.block) for p in pairs)
-        runs = jnp.einsum("rka,rkb->rab", first, second)
+        runs = run_products(first, second)
         return total.at[block].add(-runs, indices_are_sorted=True, mode="promise_in_bounds"), None
 
     first, second = jnp.asarray(system.pair_first), jnp.asarray(system.pair_second)

@@ -61,6 +61,10 @@ class SolveOptions:
             "lies in files meanwhile. [default: 80% of what is free]"
         ),
     ] = None
+    device: Annotated[
+        Literal["cpu", "gpu"] | None,
+        Parameter(help="Where the solve computes, in float64. [default: a GPU that jax sees, else the CPU]"),
+    ] = None
     max_nfev: Annotated[int, Parameter(help="The most steps tried.")] = 500
     ftol: Annotated[float, Parameter(help="Stop when the cost changes by less than this share.")] = 1e-8
     xtol: Annotated[float, Parameter(help="Stop when the unknowns change by less than this share.")] = 1e-8

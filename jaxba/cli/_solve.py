@@ -47,6 +47,7 @@ def run(file: Path, options: SolveOptions) -> int:
     problem = fix(given, options.fix).bound(**bounds)
     _check_output(out, given)
     use_compilation_cache()
+    use_device(options.device)
     begin = time.perf_counter()
     standing = _checkpoint(out, options)
     if standing is not None and standing.exists():
@@ -64,6 +65,22 @@ def run(file: Path, options: SolveOptions) -> int:
         print(f"jaxba: interrupted; {out} holds the values reached so far{again}.", file=sys.stderr)
         return INTERRUPTED
     return 0 if found.solution.converged else NOT_CONVERGED
+
+
+def use_device(name: str | None) -> None:
+    """Let jax compute on a kind of device; raise `JaxbaError` where it sees none. None leaves the choice to jax."""
+    if name is None:
+        return
+    import jax
+
+    try:
+        device = jax.devices(name)[0]
+    except RuntimeError as error:
+        raise JaxbaError(
+            f"--device {name}: jax sees no such device here ({error}). For an NVIDIA GPU: pip install 'jax[cuda12]' on "
+            "a machine that has one; without --device the solve runs on what there is."
+        ) from error
+    jax.config.update("jax_default_device", device)
 
 
 def tile_of(file: Path) -> Path:

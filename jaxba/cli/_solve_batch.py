@@ -33,6 +33,7 @@ from jaxba.cli._solve import (
     parse_bounds,
     rounds_of,
     tile_of,
+    use_device,
 )
 from jaxba.cli._text import many, to_json
 from jaxba.engine._compile_cache import use_compilation_cache
@@ -74,6 +75,7 @@ def run(files: Sequence[Path], options: SolveOptions) -> int:
     _refuse_for_several(options)
     outputs, passed_over = _outputs(files, options.out)
     use_compilation_cache()
+    use_device(options.device)
     batch = _Batch(outputs, loss, options)
     begun = time.perf_counter()
     interrupted = False

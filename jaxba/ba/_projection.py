@@ -14,6 +14,7 @@ from jaxba.ba._problem import Problem
 from jaxba.geometry import AbstractCamera, Pose
 
 _CHUNK = 16384
+_PIECE = 500_000  # observations, some 150 bytes each, that are worked on at a time
 
 
 def rotation_matrices(poses: Pose) -> Float[np.ndarray, "images 3 3"]:
@@ -30,11 +31,17 @@ def camera_centers(poses: Pose) -> Float[np.ndarray, "images 3"]:
 def points_in_cam(problem: Problem) -> Float[np.ndarray, "3 observations"]:
     """Return each observed point in the frame of its camera, metres; the last component is the depth."""
     image, point = np.asarray(problem.observations.image_index), np.asarray(problem.observations.point_index)
-    rotation = rotation_matrices(problem.poses).reshape(-1, 9).T[:, image]
-    translation = np.asarray(problem.poses.translation, float).T[:, image]
-    x, y, z = np.asarray(problem.points, float).T[:, point]
-    rows = [rotation[3 * i] * x + rotation[3 * i + 1] * y + rotation[3 * i + 2] * z + translation[i] for i in range(3)]
-    return np.stack(rows)
+    rotations = rotation_matrices(problem.poses).reshape(-1, 9).T
+    translations = np.asarray(problem.poses.translation, float).T
+    points = np.asarray(problem.points, float).T
+    found = np.empty((3, len(image)))
+    for start in range(0, len(image), _PIECE):
+        piece = slice(start, start + _PIECE)
+        rotation, translation = rotations[:, image[piece]], translations[:, image[piece]]
+        x, y, z = points[:, point[piece]]
+        for i in range(3):
+            found[i, piece] = rotation[3 * i] * x + rotation[3 * i + 1] * y + rotation[3 * i + 2] * z + translation[i]
+    return found
 
 
 def project(

@@ -15,6 +15,7 @@ from jaxba.pipeline.features import Detected, Params as FeatureParams
 from jaxba.pipeline.match import Outputs as Matched
 from jaxba.pipeline.metadata import Outputs as Described
 from jaxba.pipeline.pairs import Outputs as Paired
+from jaxba.pipeline.retrieval import Outputs as Retrieved
 from jaxba.pipeline.start import Outputs as Started
 from jaxba.pipeline.tracks import Outputs as Tracked
 from jaxba.scene import LeftOut, Photo, PhotoFile, Reference
@@ -45,6 +46,7 @@ class Done:
     pairs: Paired | None = None
     features: Detected | None = None
     features_left_out: tuple[LeftOut, ...] = ()
+    retrieval: Retrieved | None = None
     match: Matched | None = None
     match_left_out: tuple[LeftOut, ...] = ()
     tracks: Tracked | None = None

@@ -16,7 +16,7 @@ from jaxba.engine._stage import Item, Pipeline, Stage
 from jaxba.engine._store import load
 from jaxba.engine._work import Work
 from jaxba.engine._workers import Resources
-from jaxba.pipeline import adjust, control, crs, export, features, match, metadata, pairs, start, tracks
+from jaxba.pipeline import adjust, control, crs, export, features, match, metadata, pairs, retrieval, start, tracks
 from jaxba.pipeline._done import Done, made
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
 from jaxba.pipeline._settings import sections
@@ -90,10 +90,20 @@ def _without_keypoints(done: Done, found: features.Detected) -> tuple[LeftOut, .
     return tuple(LeftOut(name=done.photos[i].name, reason="; ".join(f.notes) + ".") for i, f in empty.items())
 
 
+def _retrieval(done: Done) -> retrieval.Inputs:
+    found = made(done.pairs)
+    return retrieval.Inputs(
+        pairs=found.pairs,
+        overlap=found.overlap,
+        by_order=found.by_order,
+        features=made(done.features) if len(found.by_order) else {},
+    )
+
+
 def _partners(done: Done, image: int) -> np.ndarray:
     """Return the rows of the candidate pairs that a photo is matched in: its partners come after it."""
     described = np.array(sorted(made(done.features)), dtype=int)
-    first, second = made(done.pairs).pairs.T
+    first, second = made(done.retrieval).pairs.T
     return np.flatnonzero((first == image) & np.isin(second, described) & np.isin(first, described))
 
 
@@ -104,7 +114,7 @@ def _match(done: Done) -> list[Item]:
     Heights above ground, the files and their size count where ORB may fall back to SIFT, and nowhere else.
     """
     items, reference = [], done.placed
-    found, candidates = made(done.features), made(done.pairs)
+    found, candidates = made(done.features), made(done.retrieval)
     is_orb = any(found[index].detector == "orb" for index in list(found)[:1])  # all are of one kind
     for image, photo in enumerate(done.photos):
         rows = _partners(done, image)
@@ -154,7 +164,7 @@ def _match_collected(done: Done, folders: dict[int, Path], digests: dict[int, st
     fallback: dict[int, FallbackKeypoints] = {}
     for image in sorted(folders):
         part = load(folders[image], match.Outputs)
-        pairs = made(done.pairs).pairs[_partners(done, image)]
+        pairs = made(done.retrieval).pairs[_partners(done, image)]
         graphs.append(dataclasses.replace(part.view_graph, pairs=np.ascontiguousarray(pairs)))
         images = [image, *pairs[:, 1].tolist()]
         for entry in part.fallback:  # the same of an image, whichever photo it was matched with
@@ -210,6 +220,7 @@ STAGES = (
     Stage(control, _control, reads_given=True),
     Stage(pairs, _pairs),
     Stage(features, _features, _features_collected, _features_left_out, _without_keypoints, _features_fit),
+    Stage(retrieval, _retrieval),
     Stage(match, _match, _match_collected, lambda done: done.match_left_out),
     Stage(tracks, _tracks),
     Stage(start, _start, left_out=lambda done: done.start.block.unregistered),

@@ -75,12 +75,14 @@ class Outputs:
 
     - `pairs`: image indices, the first below the second. `overlap`: share of a footprint that both see, NaN if unknown.
     - `method`: how they were found. `num_all`: of all pairs, for the saving. `notes`: what was assumed, in sentences.
+    - `by_order`: photos without a usable position, which are paired with those near in time or name alone.
     """
 
     pairs: Int[np.ndarray, "pairs 2"]
     overlap: Float[np.ndarray, " pairs"]
     method: str
     num_all: int
+    by_order: Int[np.ndarray, " some"]
     notes: tuple[str, ...] = ()
 
 
@@ -95,6 +97,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     is_placed = reference.is_used & np.isfinite(reference.xyz_m[:, :2]).all(axis=1)
     method = _method(is_placed, reference, params)
     notes: list[str] = []
+    is_by_order = ~is_placed | (method == "sequential")
+    is_by_order &= count > params.exhaustive_limit and params.method not in ("sequential", "exhaustive")
     footprints: Footprints | None = None
     if method == "exhaustive":
         pairs = np.stack(np.triu_indices(count, 1), axis=1)
@@ -102,10 +106,11 @@ def run(inputs: Inputs, params: Params) -> Outputs:
             notes.append("Every photo is paired with every other, since they have no usable positions.")
     elif method == "sequential":
         pairs = window_pairs(_flight_order(photos), params.window)
+        alike, apart = ", and with those that look alike", ": lines of a flight may not be joined"
         notes.append(
             f"Photos are paired with the {params.window} before and after them by {_order_name(photos)}, since they "
-            "have no usable positions: lines of a flight may not be joined. Give positions by a geo.txt, or set "
-            "pairs.method=exhaustive."
+            f"have no usable positions{alike if is_by_order.any() else apart}. Positions by a geo.txt are better, and "
+            "pairs.method=exhaustive pairs all."
         )
     elif method == "footprint":
         footprints, note = _footprints(photos, reference, is_placed)
@@ -119,7 +124,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         notes = [f"{len(pairs):,} of {num_all:,} pairs ({len(pairs) / max(num_all, 1):.1%}) {how}.", *more]
     overlap = np.full(len(pairs), np.nan) if footprints is None else footprint_overlaps(footprints, pairs)
     return Outputs(
-        pairs=pairs.astype(np.int32), overlap=overlap, method=method, num_all=num_all, notes=tuple(notes)
+        pairs=pairs.astype(np.int32), overlap=overlap, method=method, num_all=num_all,
+        by_order=np.flatnonzero(is_by_order), notes=tuple(notes),
     )  # fmt: skip
 
 
@@ -235,6 +241,7 @@ def _completed(
             nearest = _among(has_xy, reference, params.neighbours)
             parts += [chosen[~is_placed[chosen].all(axis=1)] for chosen in (window, nearest)]
             text = f"the {params.window} before and after by {_order_name(photos)}"
+            text += ", and with those that look alike"
         notes.append(f"Photos without a usable position: {len(loose)}; they are paired with {text}.")
     pairs = np.unique(np.sort(np.concatenate(parts), axis=1), axis=0)
     number = np.full(len(photos), -1)

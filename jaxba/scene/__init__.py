@@ -5,7 +5,7 @@ scipy is imported inside the functions that need it: it takes 0.35 s, and most c
 
 from jaxba.scene._attitude import Attitude, cam_from_enu
 from jaxba.scene._block import Block
-from jaxba.scene._candidates import joining_pairs, nearest_pairs, pairs_between, window_pairs
+from jaxba.scene._candidates import joining_pairs, nearest_pairs, pairs_between, rising_pairs, window_pairs
 from jaxba.scene._control import Control, ControlFit
 from jaxba.scene._described import described, fault, lacks_memory
 from jaxba.scene._features import Features
@@ -24,5 +24,5 @@ __all__ = [
     "FocalSource", "Footprints", "HeightKind", "LeftOut", "Lens", "LocalFrame", "Missed", "Model", "PairRecord",
     "Photo", "PhotoFile", "Position", "PrunedEdge", "Reference", "Tracks", "ViewGraph", "build_tracks",
     "cam_from_enu", "components", "described", "fault", "footprint_overlaps", "footprint_pairs", "ground_footprints",
-    "joining_pairs", "lacks_memory", "nearest_pairs", "pairs_between", "window_pairs",
+    "joining_pairs", "lacks_memory", "nearest_pairs", "pairs_between", "rising_pairs", "window_pairs",
 ]  # fmt: skip

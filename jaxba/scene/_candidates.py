@@ -22,7 +22,7 @@ def nearest_pairs(xy_m: Float[np.ndarray, "n 2"], count: int) -> Int[np.ndarray,
 
     found = np.asarray(KDTree(xy_m).query(xy_m, k=count + 1)[1])  # with itself, except among many at one place
     pairs = np.stack([np.repeat(np.arange(len(xy_m)), count + 1), found.reshape(-1)], axis=1)
-    return rising(pairs[pairs[:, 0] != pairs[:, 1]])
+    return rising_pairs(pairs[pairs[:, 0] != pairs[:, 1]])
 
 
 def window_pairs(order: Int[np.ndarray, " n"], window: int) -> Int[np.ndarray, "pairs 2"]:
@@ -32,7 +32,7 @@ def window_pairs(order: Int[np.ndarray, " n"], window: int) -> Int[np.ndarray, "
     [[0, 1], [0, 2]]
     """
     parts = [np.stack([order[:-step], order[step:]], axis=1) for step in range(1, min(window, len(order) - 1) + 1)]
-    return rising(np.concatenate([np.zeros((0, 2), np.int64), *parts]))
+    return rising_pairs(np.concatenate([np.zeros((0, 2), np.int64), *parts]))
 
 
 def joining_pairs(
@@ -49,7 +49,7 @@ def joining_pairs(
         labels = component_labels(np.concatenate([pairs, added]), len(xy_m))
         sizes = np.bincount(labels)
         if len(sizes) < 2:
-            return rising(added)
+            return rising_pairs(added)
         inside = labels == np.argmin(sizes)
         group, rest = np.flatnonzero(inside), np.flatnonzero(~inside)
         distance, nearest = map(np.asarray, KDTree(xy_m[rest]).query(xy_m[group], k=min(count, len(rest))))
@@ -66,6 +66,6 @@ def pairs_between(groups: Sequence[tuple[int, ...]], graph: ViewGraph) -> Int[np
     return between[np.argsort(-graph.num_putative[between], kind="stable")]
 
 
-def rising(pairs: Int[np.ndarray, "any 2"]) -> Int[np.ndarray, "pairs 2"]:
+def rising_pairs(pairs: Int[np.ndarray, "any 2"]) -> Int[np.ndarray, "pairs 2"]:
     """Return each pair once, its lower end first, in rising order."""
     return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64).reshape(-1, 2)

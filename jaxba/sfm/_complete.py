@@ -29,6 +29,7 @@ from jaxba.sfm._views import Views
 _NEAREST = 4  # features that compete for a point
 _QUANTILE = 0.9
 _BORDER, _MARGIN = 17, 1.05  # pixels on each side of an image; of the angle to them
+_PIECE = 50_000  # points, of which distances are computed at a time
 _LEAST_PAIRS = 50  # of matched features, to know how near they are
 
 
@@ -100,8 +101,12 @@ class _Known:
                 descriptors[here, slot] = found.descriptors[tracks.feature_index[rows[here]]]
         if descriptors is None or is_described.sum() < _LEAST_PAIRS:
             return None
-        between = _distances(descriptors[is_described, 0], descriptors[is_described, 1], is_binary)
-        return _Known(descriptors, is_described, is_binary, float(np.quantile(between, _QUANTILE)))
+        described = np.flatnonzero(is_described)
+        between = [
+            _distances(descriptors[some, 0], descriptors[some, 1], is_binary)
+            for some in np.array_split(described, len(described) // _PIECE + 1)
+        ]
+        return _Known(descriptors, is_described, is_binary, float(np.quantile(np.concatenate(between), _QUANTILE)))
 
 
 def _links_in(

@@ -7,6 +7,7 @@ from ._features import (
     detect_features as detect_features,
     grid_coverage as grid_coverage,
 )
+from ._likeness import alike_pairs as alike_pairs
 from ._nearest import (
     Descriptors as Descriptors,
     match_descriptors as match_descriptors,

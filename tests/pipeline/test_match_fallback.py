@@ -10,7 +10,7 @@ import pytest
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.engine._key import Key
 from jaxba.engine._store import save
-from jaxba.pipeline import PIPELINE, _stages, match, metadata, pairs, tracks
+from jaxba.pipeline import PIPELINE, _stages, match, metadata, retrieval, tracks
 from jaxba.pipeline._fallback import WithFallback, detect_fallback
 from jaxba.report import pair_lines
 from jaxba.scene import Block, EdgeStatus, Fallback, Features, Missed, Photo, Reference, Tracks
@@ -173,8 +173,8 @@ def test_items_of_photos_are_merged_by_image_of_the_survey(
     done = _stages.Done(files=(), settings=PIPELINE.settings)
     done.metadata = metadata.Outputs(photos=photos, left_out=())
     done.features = orb
-    done.pairs = pairs.Outputs(
-        pairs=np.array([[0, 1], [1, 2]], np.int32), overlap=np.full(2, 0.7), num_all=3, method=""
+    done.retrieval = retrieval.Outputs(
+        pairs=np.array([[0, 1], [1, 2]], np.int32), overlap=np.full(2, 0.7), num_added=0, num_photos=0
     )
     for image in (0, 1):
         own = {row: orb[image + row] for row in (0, 1)}

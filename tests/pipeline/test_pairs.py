@@ -203,6 +203,7 @@ def test_a_photo_without_position_meets_all_of_a_small_set_or_its_neighbours_in_
     assert np.sum(outputs.pairs == 30) == expected
     assert np.isnan(outputs.overlap[(outputs.pairs == 30).any(axis=1)]).all()
     assert any("without a usable position: 1;" in note for note in outputs.notes)
+    assert outputs.by_order.tolist() == ([30] if count > 150 else [])
 
 
 def test_without_positions_a_small_set_is_paired_in_full():
@@ -221,8 +222,11 @@ def test_without_positions_a_large_set_is_paired_in_sequence_and_told_the_cure()
     place = np.array([int(photo.time or 0) for photo in photos])[outputs.pairs]
     assert np.abs(place[:, 0] - place[:, 1]).max() == 3
     assert len(outputs.pairs) == 499 + 498 + 497
-    assert "geo.txt" in outputs.notes[0]
+    assert "geo.txt" in outputs.notes[0] and "look alike" in outputs.notes[0]
     assert "by time" in outputs.notes[0]
+    assert outputs.by_order.tolist() == list(range(500))
+    chosen = pairs.run(inputs, pairs.Params(window=3, method="sequential"))  # it says so, and means it
+    assert len(chosen.by_order) == 0 and "lines of a flight may not be joined" in chosen.notes[0]
 
 
 @pytest.mark.parametrize("method", ["footprint", "neighbours"])

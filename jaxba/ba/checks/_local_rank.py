@@ -37,6 +37,7 @@ _FEW_IMAGES, _FEW_ROWS = 8, 40  # of each camera that are looked at first: image
 _MOST_ROWS = 200
 _NAMED = 1e-3  # smaller components of a null direction are of rounding
 _STEP = 1e-5  # relative, of differences
+_PIECE = 500_000  # observations, some 150 bytes each, that are worked on at a time
 
 
 def pose_ranks(
@@ -46,8 +47,8 @@ def pose_ranks(
 
     - `kept`: the observations that count. `point_in_cam`: of every observation.
     """
-    image = np.asarray(problem.observations.image_index)[kept]
-    blocks, scale = _pose_blocks(image, point_in_cam[:, kept], problem.num_images)
+    image = np.asarray(problem.observations.image_index)
+    blocks, scale = _pose_blocks(image, point_in_cam, kept, problem.num_images)
     ranks = _ranks(blocks)
     if (ranks < 6).any():
         ranks = _ranks(blocks + _pose_priors(problem, scale))
@@ -87,24 +88,37 @@ def undetermined_intrinsics(
 
 
 def _pose_blocks(
-    image: Int[np.ndarray, " n"], point: Float[np.ndarray, "3 n"], count: int
+    image: Int[np.ndarray, " observations"],
+    point: Float[np.ndarray, "3 observations"],
+    kept: Int[np.ndarray, " kept"],
+    count: int,
 ) -> tuple[Float[np.ndarray, "images 6 6"], Float[np.ndarray, " images"]]:
     """Return each image's block, translations in units of its distance to the points, and that distance."""
-    distance = np.maximum(np.linalg.norm(point, axis=0), np.finfo(float).tiny)
-    number = np.bincount(image, minlength=count)
-    inverse = np.sqrt(np.bincount(image, distance**-2.0, count) / np.maximum(number, 1))
+    pieces = [kept[start : start + _PIECE] for start in range(0, len(kept), _PIECE)]
+    number, inverse_squares = np.zeros((2, count))
+    for rows in pieces:
+        number += np.bincount(image[rows], minlength=count)
+        inverse_squares += np.bincount(image[rows], _distance(point[:, rows]) ** -2.0, count)
+    inverse = np.sqrt(inverse_squares / np.maximum(number, 1))
     scale = np.where(inverse > 0, 1 / np.where(inverse > 0, inverse, 1.0), 1.0)
-    near = scale[image] / distance
-    ray = point / distance
-    blocks = np.zeros((count, 6, 6))
-    for i in range(3):
-        for j in range(i, 3):
-            across = float(i == j) - ray[i] * ray[j]
-            blocks[:, i, j] = blocks[:, j, i] = np.bincount(image, across, count)
-            blocks[:, 3 + i, 3 + j] = blocks[:, 3 + j, 3 + i] = np.bincount(image, across * near**2, count)
-    cross = hat(np.stack([np.bincount(image, ray[i] * near, count) for i in range(3)], axis=1))
+    blocks, turns = np.zeros((count, 6, 6)), np.zeros((count, 3))
+    for rows in pieces:
+        here, distance = image[rows], _distance(point[:, rows])
+        near, ray = scale[here] / distance, point[:, rows] / distance
+        for i in range(3):
+            for j in range(i, 3):
+                across = float(i == j) - ray[i] * ray[j]
+                blocks[:, i, j] += np.bincount(here, across, count)
+                blocks[:, 3 + i, 3 + j] += np.bincount(here, across * near**2, count)
+            turns[:, i] += np.bincount(here, ray[i] * near, count)
+    blocks += np.swapaxes(np.triu(blocks, 1), 1, 2)
+    cross = hat(turns)
     blocks[:, :3, 3:], blocks[:, 3:, :3] = cross, np.swapaxes(cross, 1, 2)
     return blocks, scale
+
+
+def _distance(point: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
+    return np.maximum(np.linalg.norm(point, axis=0), np.finfo(float).tiny)
 
 
 def _ranks(blocks: Float[np.ndarray, "n k k"]) -> Int[np.ndarray, " n"]:

@@ -32,8 +32,8 @@ def few_matches(case: Recorded) -> Diagnosis | None:
         if median >= _FEW_KEYPOINTS or case.stopped is None:
             return None
         return _poor_texture(texture, figures)
-    graph, overlap = done.match.view_graph, done.pairs.overlap
-    rows = _rows_of(graph.pairs, done.pairs.pairs)
+    graph, overlap = done.match.view_graph, done.retrieval.overlap
+    rows = _rows_of(graph.pairs, done.retrieval.pairs)
     overlap = np.where(rows >= 0, overlap[rows], np.nan)
     typical = done.routing.overlap
     if np.isfinite(overlap).any():

@@ -1,0 +1,73 @@
+"""Likeness of images, from their descriptors: which others each one looks most like, whatever their positions.
+
+An image is told by a vector of locally aggregated descriptors (VLAD; Jegou, Douze, Schmid and Perez 2010): each of its
+best descriptors goes to the nearest of `_WORDS` words, found by k-means among those of all images; a word's part is the
+sum of what its descriptors are off from it. Parts are scaled to unit length, so that a texture that repeats counts once
+(Arandjelovic and Zisserman 2013, "All about VLAD"), and so is the whole; likeness is the product of two vectors.
+
+Cost: two matrix products an image, 0.02 s for 1500 descriptors, and one for all pairs of images.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.cluster.vq import kmeans2
+
+from jaxba.scene import Features, rising_pairs
+from jaxba.vision._nearest import signed_bits, unit_descriptors
+
+_WORDS, _ROUNDS = 64, 10
+_BEST = 1500  # descriptors of an image
+_SAMPLE = 60_000  # of all images, that the words are found among
+_BLOCK = 512  # images compared with all others at a time
+
+
+def alike_pairs(features: Mapping[int, Features], images: Int[np.ndarray, " n"], count: int) -> Int[np.ndarray, "p 2"]:
+    """Return the pairs, rising, of each of some images with the `count` others that look most like it.
+
+    - `features`: of all images, by index, of one kind; one without keypoints is in no pair.
+    """
+    every = np.array([index for index in sorted(features) if features[index].num_keypoints], int)
+    images = images[np.isin(images, every)]
+    count = min(count, len(every) - 1)
+    if count < 1 or not len(images):
+        return np.zeros((0, 2), np.int64)
+    words = _words(features, every)
+    vectors = np.stack([_vector(_best(features[int(index)]), words) for index in every])
+    row = np.searchsorted(every, images)
+    pairs = []
+    for begin in range(0, len(row), _BLOCK):
+        these = row[begin : begin + _BLOCK]
+        likeness = vectors[these] @ vectors.T
+        likeness[np.arange(len(these)), these] = -np.inf
+        nearest = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
+        pairs.append(np.stack([np.repeat(these, count), nearest.reshape(-1)], axis=1))
+    return rising_pairs(every[np.concatenate(pairs)])
+
+
+def _best(features: Features) -> Float[np.ndarray, "rows length"]:
+    best = np.asarray(features.descriptors[:_BEST])
+    return unit_descriptors(best) if features.detector == "sift" else signed_bits(best)
+
+
+def _words(features: Mapping[int, Features], images: Int[np.ndarray, " n"]) -> Float[np.ndarray, "words length"]:
+    """Return the words, the same for the same features."""
+    rng = np.random.default_rng(0)
+    each = max(_SAMPLE // len(images), 1)
+    sample = []
+    for index in images:
+        values = _best(features[int(index)])
+        sample.append(values[rng.permutation(len(values))[:each]])
+    values = np.concatenate(sample).astype(np.float64)
+    return kmeans2(values, min(_WORDS, len(values)), iter=_ROUNDS, minit="points", rng=rng)[0].astype(np.float32)
+
+
+def _vector(
+    values: Float[np.ndarray, "rows length"], words: Float[np.ndarray, "words length"]
+) -> Float[np.ndarray, " parts"]:
+    nearest = np.argmax(values @ words.T - 0.5 * np.sum(words**2, axis=1), axis=1)
+    parts = np.zeros_like(words)
+    np.add.at(parts, nearest, values - words[nearest])
+    parts /= np.maximum(np.linalg.norm(parts, axis=1, keepdims=True), 1e-12)
+    return (parts / max(float(np.linalg.norm(parts)), 1e-12)).reshape(-1)

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from jaxba import sfm
 from jaxba._sizes import bytes_of
 from jaxba.engine._compile_cache import use_compilation_cache
-from jaxba.engine._stage import Room
+from jaxba.engine._room import Room
 from jaxba.pipeline import adjust, start, tracks
 from jaxba.scene import EdgeStatus, Features, LocalFrame, Photo, Reference, ViewGraph
 from jaxba.simulation import Survey, uav_block

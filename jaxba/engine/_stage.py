@@ -5,15 +5,12 @@ in words and in plain values what it made. What the stages of a run have made so
 stage, `done`; here nothing is known of either but their names.
 """
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from jaxba.engine._engines import Crew
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._workers import Resources
 from jaxba.scene import LeftOut
@@ -28,20 +25,6 @@ class Item:
     identity: dict[str, Any]
     megapixels: float
     partners: int = 0
-
-
-@dataclass(frozen=True)
-class Room:
-    """What a stage that does all photos at once may use; it changes no result.
-
-    - `memory_bytes`: that the process may hold. `folder`: for what it has done so far, so that a run that was stopped
-      goes on from there; it is there, and gone when the stage has ended.
-    - `crew`: opens the executors that work beside this process, which see the folder; None where none do.
-    """
-
-    memory_bytes: float
-    folder: Path
-    crew: Callable[[], AbstractContextManager[Crew | None]] = contextlib.nullcontext
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,9 @@ from jaxba.engine._limits import check_failures
 from jaxba.engine._lock import holder_file, locked
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists, refuse_photo_folder
+from jaxba.engine._room import Room
 from jaxba.engine._settings import Settings, to_toml
-from jaxba.engine._stage import Room, Stage, left_out
+from jaxba.engine._stage import Stage, left_out
 from jaxba.engine._work import Work, collected, failures, run_one, why_to_do, without_path, works
 from jaxba.engine._workers import Resources, memory_for
 from jaxba.pipeline._done import Done

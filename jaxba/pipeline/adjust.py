@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.engine._parameters import Parameters, parameter
-from jaxba.engine._stage import Room
+from jaxba.engine._room import Room
 from jaxba.engine._words import many
 from jaxba.report import Told, control_facts, grouped, sentences
 from jaxba.scene import (

@@ -15,7 +15,7 @@ from small_survey import FAST, NUM_PHOTOS, Survey, repaint
 from jaxba import JaxbaError
 from jaxba.engine import changed, from_toml
 from jaxba.engine._fingerprint import fingerprint
-from jaxba.engine._stage import Room
+from jaxba.engine._room import Room
 from jaxba.engine._store import load
 from jaxba.pipeline import NAMES, PIPELINE, Done, Event, adjust, export, run_pipeline, start
 from jaxba.scene import Finding

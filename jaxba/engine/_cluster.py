@@ -103,7 +103,10 @@ def _where_alike(versions: dict[str, str], fn: Callable[..., Any], *args: Any, *
     if other := _difference(versions, _versions()):
         raise JaxbaError(f"a worker on {platform.node()}: {other}")
     use_compilation_cache()
-    return fn(*args, **kwargs)
+    try:
+        return fn(*args, **kwargs)
+    except JaxbaError as error:
+        raise JaxbaError(f"{error} (on a worker of {platform.node()})") from error
 
 
 class Cluster:

@@ -164,6 +164,8 @@ def test_a_crew_works_where_it_is_alike(scheduler: Path, monkeypatch: pytest.Mon
     with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
         assert found is not None and len(found.executors) == 2 and 1e8 < found.memory_bytes < 1e12
         assert [executor.submit(double, k).result() for k, executor in enumerate(found.executors)] == [0, 2]
+        with pytest.raises(JaxbaError, match=r"disk full \(on a worker of "):
+            found.executors[0].submit(double, 16).result()
         monkeypatch.setattr(_cluster, "_versions", lambda: {"jaxba": "0"})
         with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
             executor = _cluster._OfWorker(client, "tcp://127.0.0.1:9")  # which is not there: another one does it

@@ -210,10 +210,11 @@ class _Told:
         self.begun_s, self.last_s = time.monotonic(), math.nan
 
     def tile(self, done: int, total: int) -> None:
-        """Log that so many of a step's tiles are done."""
+        """Log how much of a step is done; its tiles are worked on twice, up the tree and down."""
         left_s = self.last_s * (1 - done / total)
         left = f", {left_s:.0f} s left of this step" if left_s >= 1 else ""
-        _log.info("round %d, step %d, tile %d of %d%s", self.round, self.num_steps + 1, done, total, left)
+        share = 100 * done / total
+        _log.info("round %d, step %d, %.0f%% of %d tiles%s", self.round, self.num_steps + 1, share, total // 2, left)
 
     def step(self, step: HistoryStep) -> None:
         """Log that a step has ended."""

@@ -220,7 +220,7 @@ def test_rounds_that_were_stopped_go_on_to_the_same_bytes(
     found: list[Adjusted | None] = []
     caplog.set_level("INFO", "jaxba.sfm")
     whole = steps_of()
-    assert "round 1, step 2, tile 6 of 6" in caplog.text and "tile 7" not in caplog.text
+    assert "round 1, step 2, 50% of 3 tiles" in caplog.text and "round 1, step 2, 100% of 3 tiles" in caplog.text
     stop_at = next(pair for pair in whole if pair[0] == 2)
     assert steps_of(stop_at) == whole[: whole.index(stop_at) + 1] and found[1] is None
     assert steps_of() == whole[whole.index(stop_at) + 1 :]

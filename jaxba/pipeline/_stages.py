@@ -100,11 +100,16 @@ def _retrieval(done: Done) -> retrieval.Inputs:
     )
 
 
-def _partners(done: Done, image: int) -> np.ndarray:
-    """Return the rows of the candidate pairs that a photo is matched in: its partners come after it."""
-    described = np.array(sorted(made(done.features)), dtype=int)
-    first, second = made(done.retrieval).pairs.T
-    return np.flatnonzero((first == image) & np.isin(second, described) & np.isin(first, described))
+def _partners(done: Done) -> list[np.ndarray]:
+    """Return for each photo the rows of the candidate pairs that it is matched in: its partners come after it."""
+    is_described = np.zeros(len(done.photos), bool)
+    is_described[list(made(done.features))] = True
+    pairs = made(done.retrieval).pairs  # in rising order
+    ends = np.searchsorted(pairs[:, 0], np.arange(len(done.photos) + 1))
+    return [
+        rows[is_described[pairs[rows, 1]]] if is_described[image] else rows[:0]
+        for image, rows in enumerate(map(np.arange, ends[:-1], ends[1:]))
+    ]
 
 
 def _match(done: Done) -> list[Item]:
@@ -116,8 +121,7 @@ def _match(done: Done) -> list[Item]:
     items, reference = [], done.placed
     found, candidates = made(done.features), made(done.retrieval)
     is_orb = any(found[index].detector == "orb" for index in list(found)[:1])  # all are of one kind
-    for image, photo in enumerate(done.photos):
-        rows = _partners(done, image)
+    for image, (photo, rows) in enumerate(zip(done.photos, _partners(done), strict=True)):
         if len(rows) == 0:
             continue
         images = [image, *candidates.pairs[rows, 1].tolist()]
@@ -162,9 +166,10 @@ def _reference_of(reference: Reference, images: list[int], *, with_heights: bool
 def _match_collected(done: Done, folders: dict[int, Path], digests: dict[int, str]) -> match.Outputs:
     graphs, records, notes = [], [], []
     fallback: dict[int, FallbackKeypoints] = {}
+    partners = _partners(done)
     for image in sorted(folders):
         part = load(folders[image], match.Outputs)
-        pairs = made(done.retrieval).pairs[_partners(done, image)]
+        pairs = made(done.retrieval).pairs[partners[image]]
         graphs.append(dataclasses.replace(part.view_graph, pairs=np.ascontiguousarray(pairs)))
         images = [image, *pairs[:, 1].tolist()]
         for entry in part.fallback:  # the same of an image, whichever photo it was matched with

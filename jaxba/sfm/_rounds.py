@@ -37,6 +37,7 @@ _log = logging.getLogger(__name__)
 
 _SPARE = 0.03  # room for tracks that pruning cuts in two
 _LEAST_POSITIONS = 6
+_TELL_EVERY_S = 1.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -207,10 +208,14 @@ class _Told:
 
     def __init__(self, number: int) -> None:
         self.round, self.num_steps = number, 0
-        self.begun_s, self.last_s = time.monotonic(), math.nan
+        self.begun_s, self.last_s, self.told_s = time.monotonic(), math.nan, -math.inf
 
     def tile(self, done: int, total: int) -> None:
         """Log how much of a step is done; its tiles are worked on twice, up the tree and down."""
+        now_s = time.monotonic()
+        if now_s - self.told_s < _TELL_EVERY_S:
+            return
+        self.told_s = now_s
         left_s = self.last_s * (1 - done / total)
         left = f", {left_s:.0f} s left of this step" if left_s >= 1 else ""
         share = 100 * done / total

@@ -219,6 +219,7 @@ def test_rounds_that_were_stopped_go_on_to_the_same_bytes(
 
     found: list[Adjusted | None] = []
     caplog.set_level("INFO", "jaxba.sfm")
+    monkeypatch.setattr(_rounds, "_TELL_EVERY_S", 0.0)
     whole = steps_of()
     assert "round 1, step 2, 50% of 3 tiles" in caplog.text and "round 1, step 2, 100% of 3 tiles" in caplog.text
     stop_at = next(pair for pair in whole if pair[0] == 2)

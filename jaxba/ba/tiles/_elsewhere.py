@@ -90,13 +90,11 @@ class Elsewhere:
         while self._executors:
             executor = self._executors[call[0] % len(self._executors)]
             try:
-                return (
-                    executor.submit(_work_on, str(self._folder), self._memory, name, self._stamp, call),
-                    executor,
-                    call,
-                )
+                future = executor.submit(_work_on, str(self._folder), self._memory, name, self._stamp, call)
             except BrokenExecutor:
                 self._executors.remove(executor)
+            else:
+                return future, executor, call
         raise JaxbaError(f"{self._label}: executors: the processes of all of them were lost; give others.")
 
     def _result(self, name: str, future: Future[Any], executor: Executor, call: tuple[Any, ...]) -> Any:

@@ -53,14 +53,14 @@ class Parts:
 
         ends = np.where(free_pose, of_image[image], of_point[point])
         inside = ends >= 0
-        center = _centers(problem)
-        both_ends = np.concatenate([center[image[inside]], np.asarray(problem.points)[point[inside]]])
-        part_of_end = np.tile(ends[inside], 2)
-        middle, size = _extents(both_ends, part_of_end, len(anchored))
+        images, points = (_pairs(ends, index, inside) for index in (image, point))
+        seen_from = np.concatenate([_centers(problem)[images[1]], np.asarray(problem.points)[points[1]]])
+        times = np.concatenate([images[2], points[2]])
+        middle, size = _extents(seen_from, np.concatenate([images[0], points[0]]), times, len(anchored))
         return Parts(
             of_image,
             of_point,
-            _pairs(ends, image, inside & ~free_pose),
+            _pairs(ends, image, inside & ~free_pose)[:2],
             (ends[inside & ~free_point], point[inside & ~free_point]),
             middle,
             np.maximum(size, np.finfo(float).tiny),
@@ -86,35 +86,43 @@ class Parts:
 
 
 def _extents(
-    xyz: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"], count: int
+    xyz: Float[np.ndarray, "n 3"], part: Int[np.ndarray, " n"], times: Int[np.ndarray, " n"], count: int
 ) -> tuple[Float[np.ndarray, "parts 3"], Float[np.ndarray, " parts"]]:
-    """Return mean and rms extent of each part, without what lies far from the rest: one point may be a world away."""
+    """Return mean and rms extent of each part, without what lies far from the rest: one point may be a world away.
+
+    - `times`: how often each place counts.
+    """
     middle, size = np.zeros((count, 3)), np.full(count, np.inf)
     for _ in range(_TRIMMING_ROUNDS):
         near = np.sum((xyz - middle[part]) ** 2, axis=1) <= (_FAR * size[part]) ** 2
         if near.all() and np.isfinite(size).all():
             break
-        xyz, part = xyz[near], part[near]
-        middle = mean_by(xyz, part, count)
-        size = np.sqrt(mean_by(np.sum((xyz - middle[part]) ** 2, axis=1, keepdims=True), part, count))[:, 0]
+        xyz, part, times = xyz[near], part[near], times[near]
+        middle = mean_by(xyz, part, count, times)
+        squares = np.sum((xyz - middle[part]) ** 2, axis=1, keepdims=True)
+        size = np.sqrt(mean_by(squares, part, count, times))[:, 0]
     return middle, size
 
 
 def mean_by(
-    values: Float[np.ndarray, "n k"], group: Int[np.ndarray, " n"], count: int
+    values: Float[np.ndarray, "n k"],
+    group: Int[np.ndarray, " n"],
+    count: int,
+    times: Int[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, "groups k"]:
-    """Return the mean of each group, zero for one without entries."""
-    total = np.stack([np.bincount(group, column, minlength=count) for column in values.T], axis=1)
-    return total / np.maximum(np.bincount(group, minlength=count), 1)[:, None]
+    """Return the mean of each group, zero for one without entries; `times`: how often each counts, once if None."""
+    weighted = values if times is None else values * times[:, None]
+    total = np.stack([np.bincount(group, column, minlength=count) for column in weighted.T], axis=1)
+    return total / np.maximum(np.bincount(group, times, minlength=count), 1)[:, None]
 
 
 def _pairs(
     part: Int[np.ndarray, " n"], index: Int[np.ndarray, " n"], use: Bool[np.ndarray, " n"]
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Return the different (part, index) among those used."""
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Return the different (part, index) among those used, and how often each is there."""
     count = int(index.max(initial=0)) + 1
-    key = np.unique(part[use].astype(np.int64) * count + index[use])
-    return key // count, key % count
+    key, times = np.unique(part[use].astype(np.int64) * count + index[use], return_counts=True)
+    return key // count, key % count, times
 
 
 def _centers(problem: Problem) -> Float[np.ndarray, "images 3"]:

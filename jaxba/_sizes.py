@@ -53,6 +53,6 @@ def free_memory() -> float:
 
 def used_memory() -> float:
     """Return the bytes of memory that this process holds, after it has given back what it holds for nothing."""
-    with contextlib.suppress(OSError, AttributeError):  # where the C library keeps what was freed, as glibc does
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # glibc alone has it, and keeps what was freed
         ctypes.CDLL(None).malloc_trim(0)
     return float(psutil.Process().memory_info().rss)

@@ -106,7 +106,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
             notes.append("Every photo is paired with every other, since they have no usable positions.")
     elif method == "sequential":
         pairs = window_pairs(_flight_order(photos), params.window)
-        alike, apart = ", and with those that look alike", ": lines of a flight may not be joined"
+        alike = ": lines of a flight are joined by photos that look alike alone (retrieval.neighbours)"
+        apart = ": lines of a flight may not be joined"
         notes.append(
             f"Photos are paired with the {params.window} before and after them by {_order_name(photos)}, since they "
             f"have no usable positions{alike if is_by_order.any() else apart}. Positions by a geo.txt are better, and "
@@ -241,7 +242,7 @@ def _completed(
             nearest = _among(has_xy, reference, params.neighbours)
             parts += [chosen[~is_placed[chosen].all(axis=1)] for chosen in (window, nearest)]
             text = f"the {params.window} before and after by {_order_name(photos)}"
-            text += ", and with those that look alike"
+            text += ", and with those that look alike (retrieval.neighbours)"
         notes.append(f"Photos without a usable position: {len(loose)}; they are paired with {text}.")
     pairs = np.unique(np.sort(np.concatenate(parts), axis=1), axis=0)
     number = np.full(len(photos), -1)

@@ -5,6 +5,7 @@ boundary; on the way down it solves for its images, then for its points. What it
 that tile, or of all images; what it keeps from the way up for the way down stays with it.
 """
 
+import abc
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -41,7 +42,7 @@ class Up(NamedTuple):
     border_diagonal: Float[np.ndarray, " border"]
 
 
-class TileWork:
+class TileWork(abc.ABC):
     """What work on tiles needs.
 
     - `shape`, `tree`, `fronts`: of the block. `camera_index`: of its images. `free`: 1 for each free unknown of images,
@@ -62,9 +63,9 @@ class TileWork:
         self.shape, self.tree, self.fronts, self.camera_index, self.free = shape, tree, fronts, camera_index, free
         self.shelf, self.models = shelf, models
 
+    @abc.abstractmethod
     def tile(self, number: int) -> tuple[Tile, TileFronts]:
         """Return a tile and its fronts."""
-        raise NotImplementedError
 
     def system(self, number: int) -> System:
         """Return the system of a tile."""

@@ -20,10 +20,13 @@ from .ba import (
     Quality as Quality,
     Rejected as Rejected,
     Report as Report,
+    RowStatistics as RowStatistics,
     SchurDogleg as SchurDogleg,
     SchurLevenbergMarquardt as SchurLevenbergMarquardt,
     Solution as Solution,
+    Statistics as Statistics,
     Tuned as Tuned,
+    VarianceComponent as VarianceComponent,
     check_gradients as check_gradients,
     covariance as covariance,
     free_gauge as free_gauge,
@@ -37,6 +40,7 @@ from .ba import (
     solve_and_reject as solve_and_reject,
     solve_batch as solve_batch,
     solve_tiled as solve_tiled,
+    statistics as statistics,
     tune as tune,
 )
 from .geometry import (

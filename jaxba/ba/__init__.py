@@ -9,12 +9,15 @@ from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
 from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
+from jaxba.ba._reliability import RowStatistics
 from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt, residuals
+from jaxba.ba._statistics import Statistics, statistics
 from jaxba.ba._tune import Tuned, tune
 from jaxba.ba._unknowns import Step, Unknowns
+from jaxba.ba._variance_components import VarianceComponent
 from jaxba.ba.checks import Dropped, Prepared, free_gauge, prepare
 from jaxba.ba.groups import (
     PRIORS,
@@ -59,13 +62,16 @@ __all__ = [
     "Quality",
     "Rejected",
     "Report",
+    "RowStatistics",
     "Rows",
     "SchurDogleg",
     "SchurLevenbergMarquardt",
     "Solution",
+    "Statistics",
     "Step",
     "Tuned",
     "Unknowns",
+    "VarianceComponent",
     "check_gradients",
     "covariance",
     "fast_jit",
@@ -83,5 +89,6 @@ __all__ = [
     "solve_and_reject",
     "solve_batch",
     "solve_tiled",
+    "statistics",
     "tune",
 ]

@@ -10,9 +10,10 @@ import os
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba._errors import JaxbaError
+from jaxba.ba._leverage import Leverage
 from jaxba.ba._plan_shape import PlanShape, bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import rotation_matrices
@@ -81,34 +82,44 @@ def covariance(
     >>> found.poses.shape, found.points.shape[1:], found.border_names[:2]
     ((8, 6, 6), (3, 3), ('camera 0 fx', 'camera 0 fy'))
     """
-    loss = Linear() if loss is None else loss
-    check_loss("covariance: loss", loss)
-    prepared = prepare(problem)
-    problem = prepared.problem
-    require_gauge(problem, "Covariance")
-    unknowns = own_unknowns(problem)
     room: dict[str, Any] = {
         "max_memory": max_memory,
         "max_observations": max_observations,
         "folder": folder,
         "workers": workers,
     }
-    with opened("covariance", problem, loss, inverse=True, **room) as engine:
-        compile_marginals(engine, unknowns)
-        found = _marginals(engine, unknowns, 0.0)
+    return marginals_at("Covariance", problem, Linear() if loss is None else loss, with_rows=False, **room)[0]
+
+
+def marginals_at(
+    label: str, problem: Problem, loss: AbstractLoss, *, with_rows: bool, **room: Any
+) -> tuple[Covariance, tuple[Leverage, ...], Int[np.ndarray, " kept"]]:
+    """Return the covariances, the leverages of all rows where they are wanted, and the observations that took part.
+
+    - `label`: of the function that asks, for messages. `room`: as in `covariance`, whose errors it raises.
+    """
+    check_loss(f"{label.lower()}: loss", loss)
+    prepared = prepare(problem)
+    problem = prepared.problem
+    require_gauge(problem, label)
+    unknowns, rows_of = own_unknowns(problem), problem if with_rows else None
+    with opened(label.lower(), problem, loss, inverse=True, **room) as engine:
+        compile_marginals(engine, unknowns, rows_of)
+        found = _marginals(engine, unknowns, 0.0, rows_of)
         if found is None or not _determined(found):
             weakest = _weakest(_marginals(engine, unknowns, _PROBING), problem)
             raise JaxbaError(
-                f"Covariance: the measurements do not determine {weakest}. Hold it fixed or add a prior; an image "
+                f"{label}: the measurements do not determine {weakest}. Hold it fixed or add a prior; an image "
                 "needs three points or more that others see, and intrinsics need views from different heights or sides."
             )
-    return _in_order(found, [loss, *(prior.loss for prior in problem.priors)], problem, prepared.dropped)
+    losses = [loss, *(prior.loss for prior in problem.priors)]
+    return _in_order(found, losses, problem, prepared.dropped), found.leverages, prepared.kept
 
 
-def _marginals(engine: Engine, unknowns: Unknowns, damping: float) -> Marginals | None:
+def _marginals(engine: Engine, unknowns: Unknowns, damping: float, rows_of: Problem | None = None) -> Marginals | None:
     """Return the marginals, or None where there are none."""
     try:
-        return marginals(engine, unknowns, damping)
+        return marginals(engine, unknowns, damping, rows_of)
     except NotPositive:
         return None
 
@@ -136,7 +147,7 @@ def _in_order(found: Marginals, losses: list[AbstractLoss], problem: Problem, dr
         of_cameras = border[:num_shared, :num_shared].reshape(num_cameras, len(refined), num_cameras, len(refined))
         cameras = np.arange(num_cameras)
         intrinsics[np.ix_(cameras, refined, refined)] = of_cameras[cameras, :, cameras]
-    factor, redundancy = variance_factor(losses, found.squares, _num_free(problem))
+    factor, redundancy = variance_factor(losses, found.squares, float(_num_free(problem)))
     return Covariance(
         poses=poses,
         centers=centers,
@@ -146,7 +157,7 @@ def _in_order(found: Marginals, losses: list[AbstractLoss], problem: Problem, dr
         border=border,
         border_names=_border_names(shape, problem),
         variance_factor=factor,
-        redundancy=redundancy,
+        redundancy=int(redundancy),
         dropped=dropped,
     )
 

@@ -111,7 +111,7 @@ def point_equations(
         return (of_points[0].at[index].add(products, mode="promise_in_bounds"),), ()
 
     start = (jnp.zeros((system.shape.num_points, 3, 4), unknowns.points.dtype),)
-    (of_points,), _ = _scan_chunks(system, body, start)
+    (of_points,), _ = scan_chunks(system, body, start)
     gradient, hessian = of_points[:, :, 0], of_points[:, :, 1:]
     for prior in system.priors:
         rows = robust_rows(system, prior, unknowns, bend)
@@ -131,7 +131,7 @@ def linearise(system: System, unknowns: Unknowns, bend: Float[Array, ""] | float
 
     def products(part: Reprojection) -> tuple[Array, Array]:
         rows = part.rows(unknowns, lambda residual: reweighting(residual, system.loss, bend))
-        rows = _masked_columns(rows, part, system)
+        rows = masked_columns(rows, part, system)
         by_lane = jnp.swapaxes(rows, 2, 3)
         flat = by_lane.reshape(by_lane.shape[0], 2 * ROW_RUN, -1)[:, :, :first_point]
         of_images = run_products(flat, flat)
@@ -176,7 +176,7 @@ def assemble(
         jnp.zeros((shape.num_points, 3, 4), dtype),
         jnp.zeros((shape.num_points * cameras, 3, k), dtype),
     )
-    (of_points, of_shared), (run_products, w) = _scan_chunks(system, body, start)
+    (of_points, of_shared), (run_products, w) = scan_chunks(system, body, start)
     image_products = sum_runs(system, run_products)
     of_shared = jnp.swapaxes(of_shared.reshape(shape.num_points, cameras, 3, k), 1, 2)
     point_products = of_points[:, :, 1:] + blocks.points
@@ -257,12 +257,13 @@ def refined_columns(system: System) -> Int[Array, " refined"]:
     return jnp.array([i for i, refined in enumerate(system.shape.refined) if refined], jnp.int32)
 
 
-def _scan_chunks(
-    system: System,
-    body: Callable[[Any, Reprojection], tuple[Any, Any]],
-    carry: Any,
+def scan_chunks(
+    system: System, body: Callable[..., tuple[Any, Any]], carry: Any, *of_rows: Float[Array, "rows *rest"]
 ) -> tuple[Any, Any]:
-    """Fold `body` over chunks of runs; its outputs come back joined along their first axis."""
+    """Fold `body` over chunks of runs, each with its part of `of_rows`; its outputs come back joined along their rows.
+
+    - `body`: of the carry, the observations of a chunk, and its part of each of `of_rows`, by runs and lanes.
+    """
     group, runs = system.reprojection, system.shape.chunk_runs
 
     def split(a: Array | np.ndarray) -> Array:
@@ -270,17 +271,18 @@ def _scan_chunks(
 
     xy_px = jnp.swapaxes(jnp.asarray(group.xy_px).reshape(2, -1, runs, ROW_RUN), 0, 1)
     fields = (xy_px, split(group.weight), split(group.point_index), split(group.run_image))
+    beside = tuple(rows.reshape(-1, runs, ROW_RUN, *rows.shape[1:]) for rows in of_rows)
 
-    def step(carry: Any, fields: tuple[Array, ...]) -> tuple[Any, Any]:
-        xy_px, weight, point_index, run_image = fields
+    def step(carry: Any, fields: tuple[tuple[Array, ...], tuple[Array, ...]]) -> tuple[Any, Any]:
+        (xy_px, weight, point_index, run_image), beside = fields
         part = Reprojection(xy_px, weight, point_index, run_image, group.camera_index, group.model, group.refined)
-        return body(carry, part)
+        return body(carry, part, *beside)
 
-    carry, out = jax.lax.scan(step, carry, fields)
+    carry, out = jax.lax.scan(step, carry, (fields, beside))
     return carry, jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
 
 
-def _masked_columns(
+def masked_columns(
     rows: Float[Array, "runs 2 columns lanes"], group: Reprojection, system: System
 ) -> Float[Array, "runs 2 columns lanes"]:
     """Zero the columns of what is fixed."""

@@ -3,10 +3,11 @@
 With V = L L^T the block of a point and Z_i = L^-1 W_i as in `_schur.py`, and S^-1 the inverse of the reduced system,
 over images and the border of shared unknowns,
 
-    cov_x = V^-1 + V^-1 W^T S^-1 W V^-1 = L^-T (I + sum over its observations i, j of  Z_i S^-1_ij Z_j^T) L^-1
+    cov_x = V^-1 + V^-1 W^T S^-1 W V^-1 = L^-T (I + sum over its observations j of  T_j Z_j^T) L^-1
+    cov_xj = -V^-1 W^T S^-1_j = -L^-T T_j,        T_j = sum over its observations i of  Z_i S^-1_ij
 
 in which the border counts as one more block. So of S^-1 no more is needed than its blocks where the reduced system has
-some itself. Points are summed over runs of pairs of observations.
+some itself. T is summed over runs of pairs of observations.
 """
 
 from typing import NamedTuple
@@ -25,8 +26,6 @@ from jaxba.ba._schur import apply_root, eliminate
 from jaxba.ba._solvers import damped_points
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Unknowns
-
-_CHUNK = 4096  # rows summed at a time
 
 
 class InverseBlocks(NamedTuple):
@@ -49,6 +48,17 @@ class Squares(NamedTuple):
     components: Int[Array | np.ndarray, " rows"]
 
 
+class Joint(NamedTuple):
+    """Covariances of points, and of points with what they are seen by; zero for what is fixed.
+
+    - `with_images`: of the point of each row with its image. `with_border`: of each point with the border.
+    """
+
+    points: Float[Array | np.ndarray, "points 3 3"]
+    with_images: Float[Array | np.ndarray, "rows 3 block"]
+    with_border: Float[Array | np.ndarray, "points 3 border"]
+
+
 def point_marginals(
     system: System, model: Linearisation, inverse: InverseBlocks, damping: Float[Array, ""]
 ) -> Float[Array, "points 3 3"]:
@@ -56,6 +66,11 @@ def point_marginals(
 
     - `damping`: of the points' blocks, as in a step.
     """
+    return jnp.asarray(joint_marginals(system, model, inverse, damping).points)
+
+
+def joint_marginals(system: System, model: Linearisation, inverse: InverseBlocks, damping: Float[Array, ""]) -> Joint:
+    """Return the points' covariances, and those with images and border; arguments as of `point_marginals`."""
     shape = system.shape
     damped, of_points = damped_points(model, damping)
     eliminated = eliminate(damped, of_points + (1 - system.free.points))
@@ -64,38 +79,42 @@ def point_marginals(
     z = apply_root(rows_of(eliminated.root, point), eliminated.w)
     z_shared = apply_root(eliminated.root, eliminated.shared)
     num_shared = z_shared.shape[-1]
-    cross, corner = inverse.border[:, :, :num_shared], inverse.corner[:num_shared, :num_shared]  # none sees a lever arm
-    total = jnp.zeros((shape.num_points, 3, 3), z.dtype)
+    from_border = jnp.swapaxes(inverse.border[:, :, :num_shared], 1, 2)  # no point sees a lever arm
 
-    def add_pairs(total: Array, pairs: tuple[Array, Array, Array]) -> tuple[Array, None]:
+    def add_pairs(through: Array, pairs: tuple[Array, Array, Array]) -> tuple[Array, None]:
         first, second, block = pairs
         between = rows_of(inverse.off_diagonal, block)
-        product = jnp.einsum("rnij,rjk,rnlk->rnil", rows_of(z, first), between, rows_of(z, second))
-        return total.at[rows_of(point, first).reshape(-1)].add(product.reshape(-1, 3, 3)), None
+        to_second = jnp.einsum("rnij,rjk->rnik", rows_of(z, first), between)
+        to_first = jnp.einsum("rnij,rkj->rnik", rows_of(z, second), between)
+        return through.at[second].add(to_second).at[first].add(to_first), None
 
-    def add_own(carry: tuple[Array, Array], rows: Array) -> tuple[tuple[Array, Array], None]:
-        total, through = carry
-        own, seen, at = rows_of(z, rows), rows_of(image, rows), rows_of(point, rows)
-        product = jnp.einsum("nij,njk,nlk->nil", own, rows_of(inverse.diagonal, seen), own)
-        to_border = jnp.einsum("nij,njk->nik", own, rows_of(cross, seen))
-        return (total.at[at].add(product), through.at[at].add(to_border)), None
-
+    through = jnp.zeros_like(z)
     if shape.num_blocks:
         first, second = jnp.asarray(system.pair_first), jnp.asarray(system.pair_second)
         block = jnp.asarray(system.pair_block).reshape(first.shape[:2])
-        total, _ = jax.lax.scan(add_pairs, total, (first, second, block))
-    last = shape.num_rows - 1  # padding, of weight zero
-    rows = jnp.arange(shape.num_rows, dtype=jnp.int32)
-    rows = jnp.pad(rows, (0, -rows.size % _CHUNK), constant_values=last).reshape(-1, _CHUNK)
-    start = total + jnp.swapaxes(total, 1, 2), jnp.zeros_like(z_shared)
-    (total, through), _ = jax.lax.scan(add_own, start, rows)
-    mixed = jnp.einsum("nik,njk->nij", through, z_shared)
-    total += mixed + jnp.swapaxes(mixed, 1, 2)
-    total += jnp.einsum("nik,kl,njl->nij", z_shared, corner, z_shared)
+        through, _ = jax.lax.scan(add_pairs, through, (first, second, block))
+
+    def add_own(carry: tuple[Array, Array], rows: tuple[Array, ...]) -> tuple[tuple[Array, Array], Array]:
+        total, to_border = carry
+        own, through, seen, at = rows
+        through += jnp.einsum("nij,njk->nik", own, rows_of(inverse.diagonal, seen))
+        through += jnp.einsum("nig,ngk->nik", rows_of(z_shared, at), rows_of(from_border, seen))
+        product = jnp.einsum("nij,nlj->nil", through, own)
+        on_border = jnp.einsum("nij,njk->nik", own, rows_of(inverse.border, seen))
+        return (total.at[at].add(product), to_border.at[at].add(on_border)), through
+
+    def split(of_rows: Array) -> Array:
+        return of_rows.reshape(-1, shape.chunk_runs * ROW_RUN, *of_rows.shape[1:])
+
+    start = jnp.zeros((shape.num_points, 3, 3), z.dtype), z_shared @ inverse.corner[:num_shared]
+    (total, to_border), through = jax.lax.scan(add_own, start, tuple(map(split, (z, through, image, point))))
+    total += jnp.einsum("nig,nlg->nil", to_border[:, :, :num_shared], z_shared)
     lower = np.tril_indices(3)
     root = jnp.zeros((shape.num_points, 3, 3), z.dtype).at[:, lower[0], lower[1]].set(eliminated.root)
     covariances = jnp.einsum("nki,nkl,nlj->nij", root, jnp.eye(3, dtype=z.dtype) + total, root)
-    return covariances * system.free.points[:, :1, None]
+    with_images = -jnp.einsum("nki,nkj->nij", rows_of(root, point), through.reshape(z.shape))
+    with_border = -jnp.einsum("nki,nkj->nij", root, to_border)
+    return Joint(covariances * system.free.points[:, :1, None], with_images, with_border)
 
 
 def squares(system: System, unknowns: Unknowns) -> tuple[Squares, ...]:

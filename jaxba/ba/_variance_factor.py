@@ -22,10 +22,11 @@ _COUNTED = 0.99  # of errors whose squares count in full where the loss is robus
 _PASSES = 30  # each takes some 0.85 of what is left
 
 
-def variance_factor(losses: Sequence[AbstractLoss], groups: Sequence[Squares], num_free: int) -> tuple[float, int]:
+def variance_factor(losses: Sequence[AbstractLoss], groups: Sequence[Squares], num_free: float) -> tuple[float, float]:
     """Return the variance factor, NaN without redundancy, and the redundancy.
 
-    - `losses`, `groups`: of the reprojections and the priors. `num_free`: free unknowns.
+    - `losses`, `groups`: of the reprojections and the priors, or of some of them. `num_free`: free unknowns, or the
+      share of these that some groups bear.
     """
     number = sum(int(np.sum(group.components)) for group in groups)
     redundancy = number - num_free
@@ -41,7 +42,7 @@ def variance_factor(losses: Sequence[AbstractLoss], groups: Sequence[Squares], n
         limits.append(limit[group.components] * left)
         expected += left * float(np.sum(np.bincount(group.components, minlength=len(mean)) * mean))
     factor = sum(float(np.sum(group.squared)) for group in groups) / expected
-    for _ in range(_PASSES):
+    for _ in range(_PASSES if factor > 0 else 0):
         parts = [np.sum(np.minimum(g.squared, limit * factor)) for limit, g in zip(limits, groups, strict=True)]
         factor = float(sum(parts)) / expected
     return factor, redundancy

@@ -1,4 +1,4 @@
-"""The marginals of a block: the diagonal blocks of (J^T J)^-1, tile by tile.
+"""The marginals of a block: the diagonal blocks of (J^T J)^-1, and what rows have to do with it, tile by tile.
 
 Up, everything but the border is eliminated as for a step (`_engine.py`), undamped. Down, each node gets the inverse
 over its own images, its boundary and the border from that of its parent (`_fronts.py`), and each tile the covariances
@@ -14,8 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.ba._compiler import call_compiled
+from jaxba.ba._leverage import Leverage, leverages
 from jaxba.ba._linearise import Linearisation
-from jaxba.ba._point_marginals import InverseBlocks, Squares, point_marginals, squares
+from jaxba.ba._plan_shape import num_rows
+from jaxba.ba._point_marginals import InverseBlocks, Joint, Squares, joint_marginals, point_marginals, squares
+from jaxba.ba._problem import Problem
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.tiles._dense import NotPositive
@@ -28,6 +31,7 @@ class Marginals(NamedTuple):
     - `blocks`: of images. `border`: joint, of the shared unknowns.
     - `block_inflation`, `border_inflation`: each variance over what it were if all other unknowns were known.
     - `squares`: of the reprojections and the priors, by tiles.
+    - `leverages`: of the reprojections and the priors, in their order, where they were asked for; else none.
     """
 
     blocks: Float[np.ndarray, "images block block"]
@@ -36,6 +40,7 @@ class Marginals(NamedTuple):
     block_inflation: Float[np.ndarray, "images block"]
     border_inflation: Float[np.ndarray, " border"]
     squares: tuple[Squares, ...]
+    leverages: tuple[Leverage, ...] = ()
 
 
 class _OfTile(NamedTuple):
@@ -44,9 +49,10 @@ class _OfTile(NamedTuple):
     """Of the images in the tile's order; right for those that are eliminated in it."""
     points: Float[np.ndarray, "points 3 3"]
     squares: tuple[Squares, ...]
+    leverages: tuple[Leverage, ...]
 
 
-def compile_marginals(engine: Engine, unknowns: Unknowns) -> None:
+def compile_marginals(engine: Engine, unknowns: Unknowns, rows_of: Problem | None = None) -> None:
     """Compile what `marginals` calls, side by side; without it that happens when it is called."""
 
     def calls(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
@@ -58,15 +64,21 @@ def compile_marginals(engine: Engine, unknowns: Unknowns) -> None:
             np.zeros((*images, shape.border)),
             np.zeros((shape.border, shape.border)),
         )
-        return [Call(point_marginals, (system, model, inverse, np.zeros(()))), Call(squares, (system, part))]
+        of_points = system, model, inverse, np.zeros(())
+        if rows_of is None:
+            return [Call(point_marginals, of_points), Call(squares, (system, part))]
+        joint = jax.eval_shape(joint_marginals, *of_points)
+        rows = Call(leverages, (system, part, inverse, joint))
+        return [Call(joint_marginals, of_points), Call(squares, (system, part)), rows]
 
     engine.compile(unknowns, calls)
 
 
-def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0) -> Marginals:
+def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0, rows_of: Problem | None = None) -> Marginals:
     """Return the marginals at some unknowns.
 
-    - `damping`: that every diagonal is raised by, as a share of it.
+    - `damping`: that every diagonal is raised by, as a share of it. `rows_of`: the problem whose rows' leverages are
+      asked for.
 
     Raises `NotPositive` where the equations have no inverse.
     """
@@ -93,16 +105,20 @@ def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0) -> Margi
                 fronts.memory.give_back(whole)
 
     def of_tile(number: int, rest: np.ndarray) -> _OfTile:
-        return _of_tile(engine, unknowns, number, rest, corner, damping)
+        return _of_tile(engine, unknowns, number, rest, corner, damping, with_rows=rows_of is not None)
 
     points = np.zeros((len(tree.tile_of_point), 3, 3))
     parts: list[tuple[Squares, ...]] = [()] * len(engine.tiles)
+    of_rows = () if rows_of is None else _empty(rows_of)
     for found in engine.each_tile(of_tile, descend()):
         tile, _ = engine.tiles[found.number]
         own = tree.node_of_image[tile.order] <= tree.tiles[found.number]
         blocks[tile.order[own]] = found.blocks[own]
         points[tile.points[tile.plan.point_order]] = found.points
         parts[found.number] = found.squares
+        for whole, part, rows in zip(of_rows, found.leverages, (tile.rows, *tile.prior_rows), strict=False):
+            for all_rows, own_rows in zip(whole, part, strict=True):
+                all_rows[rows] = own_rows
     groups = [Squares(*map(np.concatenate, zip(*group, strict=True))) for group in zip(*parts, strict=True)]
     return Marginals(
         blocks,
@@ -111,11 +127,28 @@ def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0) -> Margi
         np.diagonal(blocks, axis1=1, axis2=2) * up.diagonal,
         np.diagonal(corner) * up.border_diagonal,
         tuple(groups),
+        of_rows,
     )
 
 
+def _empty(problem: Problem) -> tuple[Leverage, ...]:
+    """Return arrays for the leverages of all rows."""
+    own = Unknowns(problem.poses, np.zeros(problem.free.intrinsics.shape), problem.lever_arm, problem.points)
+    components = [2, *(jax.eval_shape(prior.residual, own).shape[0] for prior in problem.priors)]
+    counts = [problem.num_observations, *map(num_rows, problem.priors)]
+    shapes = zip(counts, components, strict=True)
+    return tuple(Leverage(np.zeros((n, c)), np.zeros((n, c, c)), np.zeros((n, 3, c))) for n, c in shapes)
+
+
 def _of_tile(
-    engine: Engine, unknowns: Unknowns, number: int, rest: np.ndarray, corner: np.ndarray, damping: float
+    engine: Engine,
+    unknowns: Unknowns,
+    number: int,
+    rest: np.ndarray,
+    corner: np.ndarray,
+    damping: float,
+    *,
+    with_rows: bool,
 ) -> _OfTile:
     shape, fronts = engine.shape, engine.fronts
     tile, of_tile = engine.tiles[number]
@@ -139,10 +172,21 @@ def _of_tile(
     system, own = engine.system(number), tile.take(unknowns)
     model = engine.equations(number, own, np.zeros(()))
     inverse = InverseBlocks(images, pairs, border, corner)
-    points = call_compiled(point_marginals, system, model, inverse, np.array(damping))
     found = jax.tree.map(np.asarray, call_compiled(squares, system, own))
+    of_points = system, model, inverse, np.array(damping)
+    of_rows: tuple[Leverage, ...] = ()
+    if with_rows:
+        joint: Joint = call_compiled(joint_marginals, *of_points)
+        points = joint.points
+        of_rows = tuple(call_compiled(leverages, system, own, inverse, joint))
+        seen = tile.plan.row_observation >= 0
+        place = np.argsort(tile.plan.row_observation[seen])  # no two rows are of one observation
+        takes = [np.flatnonzero(seen)[place], *(slice(len(rows)) for rows in tile.prior_rows)]
+        of_rows = tuple(Leverage(*(np.asarray(a)[t] for a in part)) for part, t in zip(of_rows, takes, strict=True))
+    else:
+        points = call_compiled(point_marginals, *of_points)
     count = len(tile.order)
-    return _OfTile(number, images[:count], np.asarray(points)[: len(tile.points)], found)
+    return _OfTile(number, images[:count], np.asarray(points)[: len(tile.points)], found, of_rows)
 
 
 def _inverse(corner: Float[np.ndarray, "border border"]) -> Float[np.ndarray, "border border"]:

@@ -1,0 +1,114 @@
+"""Statistics of an adjustment, as surveyors judge it: covariances, redundancy, tests of every measurement, weights.
+
+Everything is taken at a problem's present values, which are to be those of a solution. The covariances are those of
+`_covariance.py`; what each measurement has to do with them is computed tile by tile (`_leverage.py`), and judged in
+numpy (`_reliability.py`, `_variance_components.py`).
+"""
+
+import dataclasses
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba._errors import JaxbaError
+from jaxba.ba._covariance import Covariance, marginals_at
+from jaxba.ba._leverage import Leverage
+from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba._reliability import RowStatistics, row_statistics
+from jaxba.ba._variance_components import VarianceComponent, variance_components
+from jaxba.ba.tiles._opened import TILE_OBSERVATIONS
+from jaxba.geometry import AbstractLoss, Linear
+
+
+@dataclasses.dataclass(frozen=True)
+class Statistics:
+    """Statistics of an adjustment; every figure is a priori, of measurements whose sigmas are true.
+
+    - `covariance`: of the unknowns. `problem`: what they are of.
+    - `observations`: of the pixels, a row for each of the problem's. `priors`: of each prior, in the problem's order.
+    - `components`: how each kind of measurement scatters beside its sigmas.
+    """
+
+    covariance: Covariance
+    problem: Problem
+    observations: RowStatistics
+    priors: tuple[RowStatistics, ...]
+    components: tuple[VarianceComponent, ...]
+
+    def prior(self, name: str) -> RowStatistics:
+        """Return the statistics of a prior's rows; raises `JaxbaError` where the problem has none of the name."""
+        for rows in self.priors:
+            if rows.name == name:
+                return rows
+        names = ", ".join(rows.name for rows in self.priors) or "none"
+        raise JaxbaError(f"statistics: the problem has no prior {name!r}; it has {names}.")
+
+
+def statistics(
+    problem: Problem,
+    *,
+    loss: AbstractLoss | None = None,
+    max_memory: float | str | None = None,
+    max_observations: float = TILE_OBSERVATIONS,
+    folder: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+) -> Statistics:
+    """Return the statistics at the problem's present values; call it on `solution.apply(problem)`.
+
+    Arguments and errors are those of `covariance`.
+
+    >>> import jaxba
+    >>> survey = jaxba.synthetic.uav_block(8)
+    >>> solution = jaxba.solve(survey.problem)
+    >>> found = jaxba.statistics(solution.apply(survey.problem))
+    >>> found.prior("position").redundancy.shape
+    (8, 3)
+    """
+    loss = Linear() if loss is None else loss
+    room: dict[str, Any] = {
+        "max_memory": max_memory,
+        "max_observations": max_observations,
+        "folder": folder,
+        "workers": workers,
+    }
+    found, leverages, kept = marginals_at("Statistics", problem, loss, with_rows=True, **room)
+    of_observations, *of_priors = leverages
+    std_px = np.repeat(np.asarray(problem.observations.std_px, float)[:, None], 2, axis=1)
+    everywhere = Leverage(*(_at(np.asarray(part), kept, problem.num_observations) for part in of_observations))
+    std_px[np.setdiff1d(np.arange(len(std_px)), kept)] = np.nan
+    observations = row_statistics("observations", std_px, _weight(loss, everywhere), everywhere)
+    priors = tuple(
+        row_statistics(prior.name, _sigmas(prior, np.asarray(rows.residual).shape), _weight(prior.loss, rows), rows)
+        for prior, rows in zip(problem.priors, of_priors, strict=True)
+    )
+    components = variance_components(problem, loss, observations, priors)
+    return Statistics(found, problem, observations, priors, components)
+
+
+def _at(part: Float[np.ndarray, "kept *rest"], kept: Int[np.ndarray, " kept"], count: int) -> np.ndarray:
+    """Return the rows that took part among all, with zeros for the others."""
+    everywhere = np.zeros((count, *part.shape[1:]))
+    everywhere[kept] = part
+    return everywhere
+
+
+def _weight(loss: AbstractLoss, rows: Leverage) -> Float[np.ndarray, " rows"]:
+    """Return the weight that a loss gives each row."""
+    if isinstance(loss, Linear):
+        return np.ones(len(rows.residual))
+    with jax.enable_x64(True):
+        slope = loss.derivatives(jnp.asarray(np.sum(np.asarray(rows.residual) ** 2, axis=1)))[1]
+    return np.maximum(np.asarray(slope), 0.0)
+
+
+def _sigmas(prior: AbstractPrior, shape: tuple[int, ...]) -> Float[np.ndarray, "rows components"]:
+    """Return the sigmas of a prior's components; ones where its fields do not tell them."""
+    for field in dataclasses.fields(prior):
+        if field.name.startswith("std"):
+            std = np.asarray(getattr(prior, field.name), float)
+            return np.broadcast_to(std if std.ndim == 2 else std[:, None], shape).copy()
+    return np.ones(shape)

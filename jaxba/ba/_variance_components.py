@@ -1,0 +1,105 @@
+"""Variance components: by how much each kind of measurement scatters more than its sigmas say (Foerstner 1979).
+
+With v over sigmas and r the redundancy numbers of a kind's measurements, the factor on its variance is
+
+    k^2 = sum v^2 / sum r
+
+and as in `_variance_factor.py` where a loss is robust. It is one step of an iteration: with the sigmas multiplied by k
+and the adjustment made anew, the next factors are nearer to one. The factor's own sigma is k^2 sqrt(2 / sum r), of
+normal errors.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxba.ba._point_marginals import Squares
+from jaxba.ba._problem import Problem
+from jaxba.ba._reliability import RowStatistics
+from jaxba.ba._variance_factor import variance_factor
+from jaxba.geometry import AbstractLoss
+
+LEAST_REDUNDANCY = 8.0
+"""Of a kind, below which its factor is known to less than half of itself."""
+_HORIZONTAL, _VERTICAL = [True, True, False], [False, False, True]
+
+
+@dataclasses.dataclass(frozen=True)
+class VarianceComponent:
+    """One kind of measurement.
+
+    - `name`: `tie points`, `marks`, `position horizontal`, ... `group`: of `Problem.priors`, or `observations`.
+    - `count`, `redundancy`: measured components, and their redundancy numbers summed.
+    - `factor`: on the variance, NaN without redundancy. `factor_std`: its sigma.
+    - `stated_std`: median of the sigmas, in the group's unit.
+    - `rows`, `axes`: of the group that it is about.
+    """
+
+    name: str
+    group: str
+    count: int
+    redundancy: float
+    factor: float
+    factor_std: float
+    stated_std: float
+    rows: Bool[np.ndarray, " rows"]
+    axes: Bool[np.ndarray, " components"]
+
+    @property
+    def std(self) -> float:
+        """The sigma that the residuals show, in the group's unit."""
+        return self.stated_std * float(np.sqrt(self.factor))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is enough redundancy to rely on the factor."""
+        return self.redundancy >= LEAST_REDUNDANCY
+
+
+def variance_components(
+    problem: Problem, loss: AbstractLoss, observations: RowStatistics, priors: Sequence[RowStatistics]
+) -> tuple[VarianceComponent, ...]:
+    """Return the components of the kinds that have measurements: pixels of tie points and of control points, priors."""
+    control = problem.prior("control")
+    seen = np.asarray(problem.observations.point_index)
+    surveyed = np.zeros(problem.num_points, bool)
+    if control is not None:
+        surveyed[np.asarray(control.point_index)] = True  # type: ignore[attr-defined]
+    kinds: list[tuple[str, AbstractLoss, RowStatistics, np.ndarray, list[bool]]] = [
+        ("tie points", loss, observations, ~surveyed[seen], [True, True]),
+        ("marks", loss, observations, surveyed[seen], [True, True]),
+    ]
+    for prior, rows in zip(problem.priors, priors, strict=True):
+        every = np.ones(len(rows.weight), bool)
+        if prior.name in ("position", "control"):
+            kinds.append((f"{prior.name} horizontal", prior.loss, rows, every, _HORIZONTAL))
+            kinds.append((f"{prior.name} vertical", prior.loss, rows, every, _VERTICAL))
+        else:
+            kinds.append((prior.name.replace("_", " "), prior.loss, rows, every, [True] * rows.std.shape[1]))
+    found = (_component(name, loss, rows, mine, np.array(axes)) for name, loss, rows, mine, axes in kinds)
+    return tuple(component for component in found if component.count)
+
+
+def _component(
+    name: str, loss: AbstractLoss, rows: RowStatistics, mine: Bool[np.ndarray, " rows"], axes: Bool[np.ndarray, " axes"]
+) -> VarianceComponent:
+    redundancy = rows.redundancy[mine][:, axes]
+    used = np.isfinite(redundancy)
+    squared = np.where(used, np.nan_to_num(rows.over_sigma[mine][:, axes]) ** 2, 0.0)
+    count, total = int(used.sum()), float(np.sum(redundancy[used]))
+    groups = [Squares(squared.sum(axis=1), used.sum(axis=1))]
+    factor = variance_factor([loss], groups, count - total)[0] if total > 0 else np.nan
+    std = rows.std[mine][:, axes][used]
+    return VarianceComponent(
+        name=name,
+        group=rows.name,
+        count=count,
+        redundancy=total,
+        factor=factor,
+        factor_std=factor * float(np.sqrt(2 / total)) if total > 0 else np.nan,
+        stated_std=float(np.median(std)) if len(std) else np.nan,
+        rows=mine,
+        axes=axes,
+    )

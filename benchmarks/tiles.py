@@ -274,7 +274,7 @@ def _print_merged(label: str, found: Problem, exact: Problem, truth: Truth, seco
 def _cost(problem: Problem) -> float:
     seen = problem.observations
     errors = jaxba.reprojection_errors(problem) / np.asarray(seen.std_px)
-    unknowns = jaxba.ba.Unknowns(problem.poses, problem.cameras.parameters, problem.lever_arm, problem.points)
+    unknowns = jaxba.ba.Unknowns(problem.poses, problem.cameras.parameters, problem.antenna, problem.points)
     return 0.5 * float(np.sum(errors**2) + sum(np.sum(prior.residual(unknowns) ** 2) for prior in problem.priors))
 
 

@@ -204,9 +204,9 @@ def _evaluator(
         if rows.intrinsics is not None:
             columns.append(place(first[1], num_parameters, rows.intrinsics.index, np.arange(num_parameters)))
             blocks.append(np.swapaxes(rows.intrinsics.jacobian, 1, 2))
-        if rows.lever_arm is not None:
+        if rows.antenna is not None:
             columns.append(np.broadcast_to(first[2] + np.arange(3), (rows.residual.shape[1], 3)))
-            blocks.append(np.swapaxes(rows.lever_arm, 1, 2))
+            blocks.append(np.swapaxes(rows.antenna, 1, 2))
         if rows.point is not None:
             columns.append(place(first[3], 3, rows.point.index, np.arange(3)))
             blocks.append(np.swapaxes(rows.point.jacobian, 1, 2))

@@ -7,6 +7,7 @@ from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import project_in_cameras
+from jaxba.ba._propagate import Propagated, propagate
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
 from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
 from jaxba.ba._reliability import RowStatistics
@@ -26,6 +27,7 @@ from jaxba.ba.groups import (
     ControlPointPrior,
     IntrinsicsPrior,
     LeverArmPrior,
+    PositionOffsetPrior,
     PositionPrior,
 )
 from jaxba.ba.tiles._batch import solve_batch
@@ -56,9 +58,11 @@ __all__ = [
     "Partition",
     "Plan",
     "PlanShape",
+    "PositionOffsetPrior",
     "PositionPrior",
     "Prepared",
     "Problem",
+    "Propagated",
     "Quality",
     "Rejected",
     "Report",
@@ -81,6 +85,7 @@ __all__ = [
     "partition",
     "prepare",
     "project_in_cameras",
+    "propagate",
     "quality",
     "rejecting",
     "reprojection_errors",

@@ -262,7 +262,7 @@ def _moved(system: System, unknowns: Unknowns, equations: _Equations, system_dot
     held_dot = Unknowns(
         poses=jax.tree.map(lambda dot: jnp.where(free.poses[:, :1] > 0, 0.0, dot), start_dot.poses),
         intrinsics=jnp.where(free.intrinsics > 0, 0.0, intrinsics_dot),
-        lever_arm=jnp.where(free.lever_arm > 0, 0.0, start_dot.lever_arm),
+        antenna=jnp.where(free.antenna > 0, 0.0, start_dot.antenna),
         points=jnp.where(free.points > 0, 0.0, start_dot.points),
     )
     slope, pull = eqx.filter_jvp(gradient, (system, unknowns), (system_dot, held_dot))

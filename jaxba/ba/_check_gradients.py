@@ -243,6 +243,8 @@ def _inputs(problem: Problem, loss: AbstractLoss) -> dict[str, _Input]:
         found["fixed points"] = _Input(lambda t: t[0].points, (fixed_points & seen_points) * np.full(3, _SIZE_M))
     if not free.lever_arm and problem.prior("position") is not None:
         found["fixed lever arm"] = _Input(lambda t: t[0].lever_arm, np.full(3, _SIZE_M))
+    if len(problem.position_offset) and not free.position_offset and problem.prior("position") is not None:
+        found["fixed position offset"] = _Input(lambda t: t[0].position_offset, np.full((1, 3), _SIZE_M))
     names, free_intrinsics = type(problem.cameras).parameter_names(), np.asarray(free.intrinsics)
     values = np.stack([np.asarray(getattr(problem.cameras, name), float) for name in names], axis=-1)
     sizes = np.array([_SIZE_PX if name in ("f", "fx", "fy", "cx", "cy") else _SIZE_SHAPE for name in names])
@@ -261,26 +263,27 @@ def _inputs(problem: Problem, loss: AbstractLoss) -> dict[str, _Input]:
 def _values(solution: Solution) -> tuple[Any, ...]:
     cameras = solution.cameras
     fields = [getattr(cameras, name) for name in cameras.parameter_names()]
-    return solution.poses.quaternion, solution.poses.translation, fields, solution.lever_arm, solution.points
+    antenna = solution.lever_arm, solution.position_offset
+    return solution.poses.quaternion, solution.poses.translation, fields, *antenna, solution.points
 
 
 def _tangent(problem: Problem, dot: tuple[Any, ...]) -> Float[np.ndarray, " unknowns"]:
     """Return derivatives of the values as those along tangent steps, in one vector: `w = 2 vec(dq q*)`."""
-    quaternion, translation, fields, lever_arm, points = dot
+    quaternion, translation, fields, *rest = dot
     w = np.einsum("nij,nj->ni", _turn(problem), quaternion)
     v = translation - np.cross(w, np.asarray(problem.poses.translation))
-    return np.concatenate([np.ravel(a) for a in (w, v, np.stack(fields, axis=-1), lever_arm, points)])
+    return np.concatenate([np.ravel(a) for a in (w, v, np.stack(fields, axis=-1), *rest)])
 
 
 def _pull_back(problem: Problem, cotangent: Float[np.ndarray, " unknowns"], like: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return the transpose of `_tangent`."""
     images, cameras, names = problem.num_images, problem.num_cameras, type(problem.cameras).parameter_names()
-    sizes = np.cumsum([3 * images, 3 * images, cameras * len(names), 3])
-    w, v, intrinsics, lever_arm, points = np.split(cotangent, sizes)
+    sizes = np.cumsum([3 * images, 3 * images, cameras * len(names), 3, problem.position_offset.size])
+    w, v, intrinsics, lever_arm, offset, points = np.split(cotangent, sizes)
     w, v = w.reshape(-1, 3), v.reshape(-1, 3)
     w = w - np.cross(np.asarray(problem.poses.translation), v)
     fields = list(intrinsics.reshape(cameras, -1).T)
-    pulled = (np.einsum("nij,ni->nj", _turn(problem), w), v, fields, lever_arm, points.reshape(-1, 3))
+    pulled = (np.einsum("nij,ni->nj", _turn(problem), w), v, fields, lever_arm, offset, points)
     return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype).reshape(b.shape), pulled, like)
 
 
@@ -299,5 +302,5 @@ def _weights(problem: Problem, loss: AbstractLoss, plan: Plan) -> Float[np.ndarr
     diagonal = jax.device_get(eqx.filter_jit(lambda s, u: linearise(s, u).diagonal)(system, unknowns))
     image, camera, point = (np.argsort(o) for o in (plan.image_order, plan.camera_order, plan.point_order))
     poses = diagonal.poses[image]
-    parts = (poses[:, :3], poses[:, 3:], diagonal.intrinsics[camera], diagonal.lever_arm, diagonal.points[point])
+    parts = (poses[:, :3], poses[:, 3:], diagonal.intrinsics[camera], diagonal.antenna, diagonal.points[point])
     return np.sqrt(np.concatenate([np.ravel(part) for part in parts]))

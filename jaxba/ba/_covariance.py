@@ -39,8 +39,9 @@ class Covariance:
 
     - `poses`: tangent steps (w, v) in the camera's frame: rad and metres. `centers`: camera positions, world, m^2.
     - `intrinsics`: of each camera, in its parameters' units. `lever_arm`: camera's frame, m^2. `points`: world, m^2.
-    - `border`: joint covariance of the shared unknowns named in `border_names`: all refined intrinsics, then the lever
-      arm. Where each image has its own camera, only the lever arm.
+    - `position_offset`: of the offset that measured positions share, world, m^2.
+    - `border`: joint covariance of the shared unknowns named in `border_names`: all refined intrinsics, then lever arm
+      and position offset. Where each image has its own camera, only these.
     - `variance_factor`: near 1 where the sigmas are right, under any loss; `2 cost / redundancy` under least squares,
       and where a loss is robust the same without the tail, which no sigma describes. NaN without redundancy.
     - `redundancy`: measured components that depend on something free, minus free unknowns.
@@ -51,6 +52,7 @@ class Covariance:
     centers: Float[np.ndarray, "images 3 3"]
     intrinsics: Float[np.ndarray, "cameras parameters parameters"]
     lever_arm: Float[np.ndarray, "3 3"]
+    position_offset: Float[np.ndarray, "3 3"]
     points: Float[np.ndarray, "points 3 3"]
     border: Float[np.ndarray, "border border"]
     border_names: tuple[str, ...]
@@ -134,11 +136,14 @@ def _in_order(found: Marginals, losses: list[AbstractLoss], problem: Problem, dr
 
     names = type(problem.cameras).parameter_names()
     refined = np.flatnonzero(shape.refined)
-    num_cameras, num_shared = problem.num_cameras, shape.border - (3 if shape.lever_arm else 0)
+    num_cameras, num_shared = problem.num_cameras, shape.border - shape.antenna
     free_intrinsics = np.asarray(free.intrinsics)
     shared_free = np.zeros(0, bool) if shape.own_cameras else free_intrinsics[:, refined].reshape(-1)
-    border_free = np.append(shared_free, np.ones(shape.border - num_shared, bool))
+    border_free = np.append(shared_free, problem.free_antenna[: shape.antenna])
     border = found.border * np.outer(border_free, border_free)
+    antenna = np.zeros((6, 6))
+    antenna[: shape.antenna, : shape.antenna] = border[num_shared:, num_shared:]
+    named = [*range(num_shared), *(num_shared + np.flatnonzero(problem.free_antenna[: shape.antenna]))]
     intrinsics = np.zeros((num_cameras, len(names), len(names)))
     if shape.own_cameras:
         intrinsics[np.ix_(np.asarray(problem.camera_index), refined, refined)] = blocks[:, 6:, 6:]
@@ -152,10 +157,11 @@ def _in_order(found: Marginals, losses: list[AbstractLoss], problem: Problem, dr
         poses=poses,
         centers=centers,
         intrinsics=intrinsics,
-        lever_arm=border[num_shared:, num_shared:] if shape.lever_arm else np.zeros((3, 3)),
+        lever_arm=antenna[:3, :3],
+        position_offset=antenna[3:, 3:],
         points=found.points,
-        border=border,
-        border_names=_border_names(shape, problem),
+        border=border[np.ix_(named, named)],
+        border_names=tuple(np.array(_border_names(shape, problem))[named].tolist()),
         variance_factor=factor,
         redundancy=int(redundancy),
         dropped=dropped,
@@ -167,12 +173,13 @@ def _border_names(shape: PlanShape, problem: Problem) -> tuple[str, ...]:
     cameras = 0 if shape.own_cameras else problem.num_cameras
     refined = [n for n, r in zip(names, shape.refined, strict=True) if r]
     shared = [f"camera {c} {n}" for c in range(cameras) for n in refined]
-    return (*shared, *(f"lever arm {axis}" for axis in ("xyz" if shape.lever_arm else "")))
+    antenna = [f"{of} {axis}" for of in ("lever arm", "position offset") for axis in "xyz"]
+    return (*shared, *antenna[: shape.antenna])
 
 
 def _num_free(problem: Problem) -> int:
     free = problem.free
-    blocks = 6 * np.count_nonzero(free.poses) + 3 * np.count_nonzero(free.points) + 3 * int(np.asarray(free.lever_arm))
+    blocks = 6 * np.count_nonzero(free.poses) + 3 * np.count_nonzero(free.points) + int(problem.free_antenna.sum())
     return int(blocks + np.count_nonzero(free.intrinsics))
 
 

@@ -49,7 +49,7 @@ def scaled_norm_of(step: Step, diagonal: Step) -> Float[Array, ""]:
 def squared_in_sigmas(model: Linearisation, step: Step) -> Float[Array, ""]:
     """Return the squared length of a step in what each unknown is known to by itself: in sigmas, all others fixed."""
     blocks = (step.poses, model.diagonal.poses), (step.intrinsics, model.diagonal.intrinsics)
-    squares = sum_all([jnp.sum(s**2 * d) for s, d in (*blocks, (step.lever_arm, model.diagonal.lever_arm))])
+    squares = sum_all([jnp.sum(s**2 * d) for s, d in (*blocks, (step.antenna, model.diagonal.antenna))])
     return squares + jnp.einsum("pi,pij,pj->", step.points, model.point_products, step.points)
 
 

@@ -102,14 +102,15 @@ def _of_prior(
     of_images: Float[Array, "images columns columns"],
     of_points: Float[Array, "points 3 3"],
 ) -> Leverage:
-    """Return those of a prior, whose rows touch one kind of unknowns, or a pose and the lever arm."""
+    """Return those of a prior, whose rows touch one kind of unknowns, or a pose and the antenna."""
     plain = dataclasses.replace(prior, loss=Linear())
     rows = robust_rows(system, plain, unknowns, jnp.zeros(()))
     residual = jnp.asarray(rows.residual).T
     count, components = residual.shape
     reach = jnp.zeros((count, 3, components), residual.dtype)
     leverage = jnp.zeros((count, components, components), residual.dtype)
-    lever = slice(inverse.corner.shape[0] - 3, inverse.corner.shape[0])
+    border = inverse.corner.shape[0]
+    antenna = slice(border - system.shape.antenna, border)
     if rows.point is not None:
         reach = jnp.einsum("nij,cjn->nic", rows_of(of_points, rows.point.index), rows.point.jacobian)
         leverage += jnp.einsum("cin,nid->ncd", rows.point.jacobian, reach)
@@ -118,16 +119,16 @@ def _of_prior(
     if rows.pose is not None:
         index, by_pose = rows.pose.index, rows.pose.jacobian
         on_pose = jnp.einsum("nab,cbn->nac", rows_of(of_images[:, :6, :6], index), by_pose)
-        if rows.lever_arm is not None and system.shape.lever_arm:
-            across = rows_of(jnp.asarray(inverse.border)[:, :6, lever], index)
-            on_pose += jnp.einsum("nai,cin->nac", across, rows.lever_arm)
-            leverage += jnp.einsum("cin,nai,dan->ncd", rows.lever_arm, across, by_pose)
+        if rows.antenna is not None and system.shape.antenna:
+            across = rows_of(jnp.asarray(inverse.border)[:, :6, antenna], index)
+            on_pose += jnp.einsum("nai,cin->nac", across, rows.antenna)
+            leverage += jnp.einsum("cin,nai,dan->ncd", rows.antenna, across, by_pose)
         leverage += jnp.einsum("can,nad->ncd", by_pose, on_pose)
         rotation = rows_of(unknowns.poses.rotation, index)
         reach = jnp.einsum("nji,njc->nic", rotation, on_pose[:, 3:])
-    if rows.lever_arm is not None and system.shape.lever_arm:
-        arm = jnp.asarray(inverse.corner)[lever, lever]
-        leverage += jnp.einsum("cin,ij,djn->ncd", rows.lever_arm, arm, rows.lever_arm)
+    if rows.antenna is not None and system.shape.antenna:
+        of_antenna = jnp.asarray(inverse.corner)[antenna, antenna]
+        leverage += jnp.einsum("cin,ij,djn->ncd", rows.antenna, of_antenna, rows.antenna)
     return Leverage(residual, leverage, reach)
 
 

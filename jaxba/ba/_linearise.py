@@ -189,13 +189,13 @@ def assemble(
     gradient = Step(
         poses=gradient.poses + image_products[:, :6, 6 + k],
         intrinsics=jnp.asarray(gradient.intrinsics).at[:, refined].add(of_cameras),
-        lever_arm=gradient.lever_arm,
+        antenna=gradient.antenna,
         points=gradient.points + of_points[:, :, 0],
     )
     diagonal = Step(
         poses=diagonal_of(blocks.poses) + squares[:, :6],
         intrinsics=diagonal_of(blocks.intrinsics).at[:, refined].add(sum_cameras(system, squares[:, 6:])),
-        lever_arm=jnp.diagonal(blocks.lever_arm),
+        antenna=jnp.diagonal(blocks.antenna),
         points=diagonal_of(point_products),
     )
     return Linearisation(
@@ -223,8 +223,8 @@ def curvature(system: System, model: Linearisation, step: Step) -> Float[Array, 
     blocks = model.prior_blocks  # the points' blocks hold the priors on points already
     total += jnp.einsum("ma,mab,mb->", step.poses, blocks.poses, step.poses)
     total += jnp.einsum("ca,cab,cb->", step.intrinsics, blocks.intrinsics, step.intrinsics)
-    total += jnp.einsum("a,ab,b->", step.lever_arm, blocks.lever_arm, step.lever_arm)
-    total += 2 * jnp.einsum("ma,mab,b->", step.poses, blocks.poses_lever_arm, step.lever_arm)
+    total += jnp.einsum("a,ab,b->", step.antenna, blocks.antenna, step.antenna)
+    total += 2 * jnp.einsum("ma,mab,b->", step.poses, blocks.poses_antenna, step.antenna)
     return total
 
 

@@ -28,7 +28,8 @@ class PlanShape:
     """Which of the camera model's parameters are free in any camera."""
     own_cameras: bool
     """Each image has its own camera, eliminated with the pose; else the intrinsics are a shared border."""
-    lever_arm: bool
+    antenna: int
+    """Columns of lever arm and common offset of positions in the border, where any of these is free; else 0."""
     any_fixed_pose: bool
     any_fixed_point: bool
     any_bound: bool
@@ -56,12 +57,12 @@ class PlanShape:
 
     @property
     def border(self) -> int:
-        """Shared unknowns: refined intrinsics of all cameras, then the lever arm."""
-        return self.num_shared_cameras * self.num_refined + (3 if self.lever_arm else 0)
+        """Shared unknowns: refined intrinsics of all cameras, then lever arm and common offset of positions."""
+        return self.num_shared_cameras * self.num_refined + self.antenna
 
 
 _NOTHING = PlanShape(
-    num_images=0, num_points=0, num_rows=0, chunk_runs=0, num_cameras=0, refined=(), own_cameras=False, lever_arm=False,
+    num_images=0, num_points=0, num_rows=0, chunk_runs=0, num_cameras=0, refined=(), own_cameras=False, antenna=0,
     any_fixed_pose=False, any_fixed_point=False, any_bound=False, num_pair_runs=0, num_blocks=0, linear_solver="dense",
     panel_images=1, band_panels=0, prior_rows=(),
 )  # fmt: skip
@@ -70,7 +71,7 @@ _NOTHING = PlanShape(
 def bare_shape(problem: Problem, like: PlanShape | None = None) -> PlanShape:
     """Return the shape that says what is free and nothing of sizes, or those of `like`."""
     least = _NOTHING if like is None else like
-    free = problem.free
+    free, free_antenna = problem.free, problem.free_antenna
     refined = np.atleast_1d(np.asarray(free.intrinsics).any(axis=0))
     rows = [bucket(num_rows(prior)) for prior in problem.priors]
     if len(rows) == len(least.prior_rows):
@@ -84,7 +85,7 @@ def bare_shape(problem: Problem, like: PlanShape | None = None) -> PlanShape:
         num_cameras=problem.num_cameras,
         refined=tuple(bool(r) for r in refined),
         own_cameras=own_cameras,
-        lever_arm=bool(free.lever_arm),
+        antenna=len(free_antenna) if free_antenna.any() else 0,
         any_fixed_pose=not np.asarray(free.poses).all() or least.any_fixed_pose,
         any_fixed_point=not np.asarray(free.points).all() or least.any_fixed_point,
         any_bound=any_bound(problem),

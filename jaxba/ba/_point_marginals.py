@@ -128,7 +128,7 @@ def squares(system: System, unknowns: Unknowns) -> tuple[Squares, ...]:
         residual, rows = prior.residual(unknowns), robust_rows(system, prior, unknowns, jnp.zeros(()))
         depends = jnp.zeros(residual.shape, bool)
         blocks = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
-        for derivative in [*blocks, *([] if rows.lever_arm is None else [rows.lever_arm])]:
+        for derivative in [*blocks, *([] if rows.antenna is None else [rows.antenna])]:
             depends |= jnp.any(derivative != 0, axis=1)
         groups.append((residual, depends))
     return tuple(

@@ -1,7 +1,7 @@
 """Rows of priors: made robust, masked by what is free, multiplied and summed.
 
-What the normal equations need of all priors together is one block an image, a camera and a point, the lever arm's, and
-the lever arm's with each image: `PriorBlocks`. No prior couples anything else.
+What the normal equations need of all priors together is one block an image, a camera and a point, that of the
+antenna (lever arm and common offset), and the antenna's with each image: `PriorBlocks`. No prior couples anything else.
 """
 
 import equinox as eqx
@@ -31,12 +31,12 @@ def robust_rows(system: System, prior: AbstractPrior, unknowns: Unknowns, bend: 
             return None
         return JacobianBlock(block.index, robust(block.jacobian) * rows_of(mask, block.index).T[None])
 
-    lever_arm = None if rows.lever_arm is None else robust(rows.lever_arm) * free.lever_arm[:, None]
+    antenna = None if rows.antenna is None else robust(rows.antenna) * free.antenna[:, None]
     return Rows(
         jnp.stack(residual),
         block(rows.pose, free.poses),
         block(rows.intrinsics, free.intrinsics),
-        lever_arm,
+        antenna,
         block(rows.point, free.points),
     )
 
@@ -46,8 +46,8 @@ class PriorBlocks(eqx.Module):
 
     poses: Float[Array, "images 6 6"]
     intrinsics: Float[Array, "cameras parameters parameters"]
-    lever_arm: Float[Array, "3 3"]
-    poses_lever_arm: Float[Array, "images 6 3"]
+    antenna: Float[Array, "antenna antenna"]
+    poses_antenna: Float[Array, "images 6 antenna"]
     points: Float[Array, "points 3 3"]
 
     @staticmethod
@@ -60,8 +60,8 @@ class PriorBlocks(eqx.Module):
         return PriorBlocks(
             poses=zeros(like.poses, 6),
             intrinsics=zeros(like.intrinsics, like.intrinsics.shape[1]),
-            lever_arm=zeros(like.lever_arm, 3),
-            poses_lever_arm=zeros(like.poses, 3),
+            antenna=zeros(like.antenna, like.antenna.shape[0]),
+            poses_antenna=zeros(like.poses, like.antenna.shape[0]),
             points=zeros(like.points, 3),
         )
 
@@ -89,7 +89,7 @@ def add_second_derivatives(
         step = Step(
             moved(zero.poses, "pose"),
             moved(zero.intrinsics, "intrinsics"),
-            moved(zero.lever_arm, "lever_arm"),
+            moved(zero.antenna, "antenna"),
             moved(zero.points, "point"),
         )
         return prior.residual(unknowns.retract(step))
@@ -106,7 +106,7 @@ def add_second_derivatives(
     hessian += 2 * bent[:, None, None] * through[:, :, None] * through[:, None]
     masks = {"pose": free.poses, "intrinsics": free.intrinsics, "point": free.points}
     for kind, place in places.items():
-        mask = free.lever_arm[None] if kind == "lever_arm" else rows_of(masks[kind], getattr(rows, kind).index)
+        mask = free.antenna[None] if kind == "antenna" else rows_of(masks[kind], getattr(rows, kind).index)
         hessian = hessian.at[:, place].multiply(mask[:, :, None]).at[:, :, place].multiply(mask[:, None])
     return _add(blocks, rows, hessian)
 
@@ -115,7 +115,7 @@ def _by_kind(rows: Rows) -> dict[str, Float[Array, "components columns rows"]]:
     """Return the derivatives by each kind of unknown that the rows touch."""
     blocks = {"pose": rows.pose, "intrinsics": rows.intrinsics, "point": rows.point}
     found = {kind: block.jacobian for kind, block in blocks.items() if block is not None}
-    return found if rows.lever_arm is None else {**found, "lever_arm": rows.lever_arm}
+    return found if rows.antenna is None else {**found, "antenna": rows.antenna}
 
 
 def _places(rows: Rows) -> dict[str, slice]:
@@ -135,16 +135,16 @@ def _add(blocks: PriorBlocks, rows: Rows, matrix: Float[Array, "rows columns col
         of_kind = matrix[:, places[kind], places[kind]]
         return total + segments(of_kind, getattr(rows, kind).index, total.shape[0])
 
-    lever_arm, cross = blocks.lever_arm, blocks.poses_lever_arm
-    if "lever_arm" in places:
-        lever_arm += jnp.sum(matrix[:, places["lever_arm"], places["lever_arm"]], axis=0)
+    antenna, cross = blocks.antenna, blocks.poses_antenna
+    if "antenna" in places:
+        antenna += jnp.sum(matrix[:, places["antenna"], places["antenna"]], axis=0)
         if rows.pose is not None:
-            across = matrix[:, places["pose"], places["lever_arm"]]
+            across = matrix[:, places["pose"], places["antenna"]]
             cross += segments(across, rows.pose.index, cross.shape[0])
     return PriorBlocks(
         square(blocks.poses, "pose"),
         square(blocks.intrinsics, "intrinsics"),
-        lever_arm,
+        antenna,
         cross,
         square(blocks.points, "point"),
     )
@@ -156,13 +156,13 @@ def transpose_product(rows: Rows, values: Float[Array, "components rows"], zero:
     def of_kind(block: JacobianBlock | None, zero: Array | np.ndarray) -> Array:
         return jnp.asarray(zero) if block is None else block_transpose(block, values, zero.shape[0])
 
-    lever_arm = zero.lever_arm
-    if rows.lever_arm is not None:
-        lever_arm = jnp.einsum("ckn,cn->k", rows.lever_arm, values)
+    antenna = zero.antenna
+    if rows.antenna is not None:
+        antenna = jnp.einsum("ckn,cn->k", rows.antenna, values)
     return Step(
         of_kind(rows.pose, zero.poses),
         of_kind(rows.intrinsics, zero.intrinsics),
-        lever_arm,
+        antenna,
         of_kind(rows.point, zero.points),
     )
 

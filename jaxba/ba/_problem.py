@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
@@ -67,6 +69,7 @@ class Free(eqx.Module):
     points: Bool[Array | np.ndarray, " points"]
     intrinsics: Bool[Array | np.ndarray, "cameras parameters"]
     lever_arm: Bool[Array | np.ndarray, ""]
+    position_offset: Bool[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.array(False))
 
 
 class Problem(eqx.Module):
@@ -82,6 +85,8 @@ class Problem(eqx.Module):
     - `free`: what may change.
     - `lower`, `upper`: bounds on the intrinsics, infinite where there is none.
     - `image_names`: used in messages; empty, or one an image.
+    - `position_offset`: what all positions of the position prior have in common beside their errors, measured minus
+      true, metres, world: one row, where a problem has such an unknown; else none.
 
     `Problem.build` fills in the defaults; `fix` and `bound` return changed copies.
     """
@@ -97,6 +102,7 @@ class Problem(eqx.Module):
     lower: Float[Array | np.ndarray, "cameras parameters"]
     upper: Float[Array | np.ndarray, "cameras parameters"]
     image_names: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    position_offset: Float[Array | np.ndarray, "offsets 3"] = eqx.field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def num_images(self) -> int:
@@ -113,6 +119,21 @@ class Problem(eqx.Module):
     @property
     def num_cameras(self) -> int:
         return self.lower.shape[0]
+
+    @property
+    def antenna(self) -> Any:
+        """Lever arm and position offset in one vector, numpy unless one of them is traced."""
+        parts = self.lever_arm, self.position_offset
+        xp = _namespace(parts)
+        return xp.concatenate([xp.asarray(part).reshape(-1) for part in parts])
+
+    @property
+    def free_antenna(self) -> Any:
+        """Which entries of `antenna` may change, likewise."""
+        free = self.free.lever_arm, self.free.position_offset
+        xp = _namespace(free)
+        counts = 3, 3 * self.position_offset.shape[0]
+        return xp.concatenate([xp.asarray(of) & np.ones(n, bool) for of, n in zip(free, counts, strict=True)])
 
     @staticmethod
     def build(
@@ -195,6 +216,7 @@ class Problem(eqx.Module):
             np.asarray(self.free.points) & ~fixed_points,
             np.asarray(self.free.intrinsics) & ~fixed_intrinsics,
             self.free.lever_arm,
+            self.free.position_offset,
         )
         return eqx.tree_at(lambda p: p.free, self, free)
 
@@ -237,3 +259,8 @@ class Problem(eqx.Module):
         """Return `image 14 (DJI_0021.JPG)`, for messages."""
         name = f" ({self.image_names[index]})" if self.image_names else ""
         return f"image {index}{name}"
+
+
+def _namespace(parts: Sequence[Any]) -> Any:
+    """numpy for concrete values, jax.numpy where anything is traced."""
+    return jnp if any(isinstance(part, Tracer) for part in parts) else np

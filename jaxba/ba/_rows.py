@@ -34,7 +34,7 @@ class Rows(eqx.Module):
     residual: Float[Array, "components rows"]
     pose: JacobianBlock | None = None
     intrinsics: JacobianBlock | None = None
-    lever_arm: Float[Array, "components 3 rows"] | None = None
+    antenna: Float[Array, "components antenna rows"] | None = None
     point: JacobianBlock | None = None
 
 

@@ -99,9 +99,9 @@ def eliminate_points(system: System, model: Linearisation, damping: Step) -> Red
         by_camera = by_camera.at[images, :, camera, :].add(before[:, :6, 6:])
         border = by_camera.reshape(shape.num_images, 6, num_shared)
         corner = _add_cameras(corner, sum_cameras(system, before[:, 6:, 6:]))
-    lever = shape.border - num_shared
-    border = jnp.pad(border, ((0, 0), (0, 0), (0, lever)))
-    corner = jnp.pad(corner, ((0, lever), (0, lever))) + _diagonal_matrix(vector.border)
+    antenna = shape.border - num_shared
+    border = jnp.pad(border, ((0, 0), (0, 0), (0, antenna)))
+    corner = jnp.pad(corner, ((0, antenna), (0, antenna))) + _diagonal_matrix(vector.border)
     diagonal, border, corner = _add_priors(system, model.prior_blocks, diagonal, border, corner)
     return Reduced(diagonal, _sum_pairs(system, z), border, corner, points)
 
@@ -143,9 +143,9 @@ def solve_points(
 def to_reduced(system: System, step: Step) -> ReducedVector:
     """Return the images' and the border's part of a step."""
     shape = system.shape
-    poses, lever_arm = jnp.asarray(step.poses), jnp.asarray(step.lever_arm)
+    poses, antenna = jnp.asarray(step.poses), jnp.asarray(step.antenna)
     intrinsics = step.intrinsics[:, refined_columns(system)]
-    border = lever_arm if shape.lever_arm else lever_arm[:0]
+    border = antenna if shape.antenna else antenna[:0]
     if shape.own_cameras:
         return ReducedVector(jnp.concatenate([poses, intrinsics], axis=1), border)
     return ReducedVector(poses, jnp.concatenate([intrinsics.reshape(-1), border]))
@@ -161,9 +161,9 @@ def from_reduced(system: System, vector: ReducedVector, like: Step) -> Step:
         if shape.own_cameras
         else vector.border[:shared].reshape(shape.num_cameras, shape.num_refined)
     )
-    lever_arm = vector.border[shared:] if shape.lever_arm else zero.lever_arm
+    antenna = vector.border[shared:] if shape.antenna else zero.antenna
     intrinsics = zero.intrinsics.at[:, refined_columns(system)].set(refined)
-    return Step(vector.images[:, :6], intrinsics, lever_arm, zero.points)
+    return Step(vector.images[:, :6], intrinsics, antenna, zero.points)
 
 
 def _eliminate_rows(
@@ -245,7 +245,7 @@ def _add_priors(
     border: Float[Array, "images block border"],
     corner: Float[Array, "border border"],
 ) -> tuple[Array, Array, Array]:
-    """Add the priors' blocks of poses, intrinsics and lever arm."""
+    """Add the priors' blocks of poses, intrinsics and antenna."""
     shape, refined = system.shape, refined_columns(system)
     diagonal = diagonal.at[:, :6, :6].add(blocks.poses)
     of_cameras = blocks.intrinsics[:, refined[:, None], refined]
@@ -253,10 +253,10 @@ def _add_priors(
         diagonal = diagonal.at[:, 6:, 6:].add(of_cameras)
     elif shape.num_refined:
         corner = _add_cameras(corner, of_cameras)
-    if shape.lever_arm:
-        lever = slice(shape.border - 3, shape.border)
-        corner = corner.at[lever, lever].add(blocks.lever_arm)
-        border = border.at[:, :6, lever].add(blocks.poses_lever_arm)
+    if shape.antenna:
+        antenna = slice(shape.border - shape.antenna, shape.border)
+        corner = corner.at[antenna, antenna].add(blocks.antenna)
+        border = border.at[:, :6, antenna].add(blocks.poses_antenna)
     return diagonal, border, corner
 
 

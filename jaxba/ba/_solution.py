@@ -113,6 +113,7 @@ class Solution(eqx.Module):
     status: Int[Array | np.ndarray, ""]
     num_steps: Int[Array | np.ndarray, ""]
     report: Report | None = eqx.field(static=True, default=None)
+    position_offset: Float[Array | np.ndarray, "offsets 3"] = eqx.field(default_factory=lambda: np.zeros((0, 3)))
 
     @staticmethod
     def of(
@@ -133,6 +134,7 @@ class Solution(eqx.Module):
             status=status,
             num_steps=num_steps,
             report=report,
+            position_offset=values.position_offset,
         )
 
     @property
@@ -185,6 +187,7 @@ class Solution(eqx.Module):
         """Return the problem with the solution's values as start values."""
 
         def unknowns(p: Problem) -> tuple[object, ...]:
-            return p.poses, p.cameras, p.points, p.lever_arm
+            return p.poses, p.cameras, p.points, p.lever_arm, p.position_offset
 
-        return eqx.tree_at(unknowns, problem, (self.poses, self.cameras, self.points, self.lever_arm))
+        values = self.poses, self.cameras, self.points, self.lever_arm, self.position_offset
+        return eqx.tree_at(unknowns, problem, values)

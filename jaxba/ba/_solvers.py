@@ -371,13 +371,13 @@ def step_bounds(system: System, unknowns: Unknowns) -> tuple[Array | None, Array
     """Bounds of the border's step; None where nothing is bounded."""
     if not system.shape.any_bound:
         return None, None
-    infinite = jnp.full(3, jnp.inf, unknowns.points.dtype)
+    infinite = jnp.full(unknowns.antenna.shape, jnp.inf, unknowns.points.dtype)
 
-    def border(bound: Array | np.ndarray, lever_arm: Array) -> Array:
+    def border(bound: Array | np.ndarray, antenna: Array) -> Array:
         like = Step(
             jnp.zeros((system.shape.num_images, 6), bound.dtype),
             bound - unknowns.intrinsics,
-            lever_arm,
+            antenna,
             unknowns.points,
         )
         vector: ReducedVector = to_reduced(system, like)

@@ -105,7 +105,7 @@ def make_system(problem: Problem, plan: Plan, loss: AbstractLoss, dtype: Any = n
         poses=_padded(xp, problem.free.poses, plan.image_order, shape.num_images, 0.0, dtype)[:, None]
         * xp.ones((1, 6), dtype),
         intrinsics=_padded(xp, problem.free.intrinsics, plan.camera_order, shape.num_cameras, 0.0, dtype),
-        lever_arm=xp.asarray(problem.free.lever_arm, dtype) * xp.ones(3, dtype),
+        antenna=xp.asarray(problem.free_antenna, dtype),
         points=_padded(xp, problem.free.points, plan.point_order, shape.num_points, 0.0, dtype)[:, None]
         * xp.ones((1, 3), dtype),
     )
@@ -131,7 +131,7 @@ def initial_unknowns(problem: Problem, plan: Plan, dtype: Any = np.float64) -> U
     xp = _namespace((problem, plan))
     names = type(problem.cameras).parameter_names()
     parameters = xp.stack([xp.asarray(getattr(problem.cameras, name), dtype) for name in names], axis=-1)
-    return arrange(Unknowns(problem.poses, parameters, problem.lever_arm, problem.points), plan, dtype)
+    return arrange(Unknowns(problem.poses, parameters, problem.antenna, problem.points), plan, dtype)
 
 
 def own_unknowns(problem: Problem) -> Unknowns:
@@ -139,7 +139,7 @@ def own_unknowns(problem: Problem) -> Unknowns:
     names = type(problem.cameras).parameter_names()
     intrinsics = np.stack([np.asarray(getattr(problem.cameras, name), float) for name in names], axis=-1)
     poses = Pose(np.array(problem.poses.quaternion, float), np.array(problem.poses.translation, float))
-    return Unknowns(poses, intrinsics, np.array(problem.lever_arm, float), np.array(problem.points, float))
+    return Unknowns(poses, intrinsics, np.array(problem.antenna, float), np.array(problem.points, float))
 
 
 def arrange(unknowns: Unknowns, plan: Orders, dtype: Any = np.float64) -> Unknowns:
@@ -156,7 +156,7 @@ def arrange(unknowns: Unknowns, plan: Orders, dtype: Any = np.float64) -> Unknow
             _padded(xp, unknowns.poses.translation, plan.image_order, shape.num_images, 0.0, dtype),
         ),
         intrinsics=_padded(xp, unknowns.intrinsics, plan.camera_order, shape.num_cameras, None, dtype),
-        lever_arm=xp.asarray(unknowns.lever_arm, dtype),
+        antenna=xp.asarray(unknowns.antenna, dtype),
         points=_padded(xp, unknowns.points, plan.point_order, shape.num_points, 1.0, dtype),
     )
 
@@ -171,7 +171,7 @@ def restore(unknowns: Unknowns, plan: Orders) -> Unknowns:
             xp.asarray(unknowns.poses.quaternion)[image_rank], xp.asarray(unknowns.poses.translation)[image_rank]
         ),
         intrinsics=xp.asarray(unknowns.intrinsics)[camera_rank],
-        lever_arm=xp.asarray(unknowns.lever_arm),
+        antenna=xp.asarray(unknowns.antenna),
         points=xp.asarray(unknowns.points)[point_rank],
     )
 

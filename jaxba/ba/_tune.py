@@ -156,10 +156,7 @@ def tune(
                 "wider scale."
             )
     tuned_problem, tuned_loss = _apply(problem, loss, learn, best[1], np)
-    poses, cameras, points, lever_arm = jax.device_get(best[2])
-    tuned_problem = eqx.tree_at(
-        lambda p: (p.poses, p.cameras, p.points, p.lever_arm), tuned_problem, (poses, cameras, points, lever_arm)
-    )
+    tuned_problem = eqx.tree_at(_values, tuned_problem, tuple(jax.device_get(best[2])))
     tuned_loss = jax.tree.map(float, tuned_loss)
     learned = {name: float(value) for name, value in _physical(learn, best[1], loss, np).items()}
     return Tuned(tuned_loss, tuned_problem, learned, best[0], np.array(history), approximate_steps, stopped)
@@ -230,7 +227,7 @@ def _evaluation(
     def one(parameters: Any, values: Any) -> tuple[Array, Any]:
         of_problem, of_loss = _apply(problem, loss, learn, parameters, jnp)
         values = jax.lax.stop_gradient(values)
-        of_problem = eqx.tree_at(lambda p: (p.poses, p.cameras, p.points, p.lever_arm), of_problem, values)
+        of_problem = eqx.tree_at(_values, of_problem, values)
         found = solve(of_problem, loss=of_loss, plan=plan, adjoint=adjoint)
         return score(_values(found)), jax.lax.stop_gradient(_values(found))
 
@@ -244,8 +241,9 @@ def _evaluation(
     return evaluate
 
 
-def _values(solution: Solution) -> tuple[Any, ...]:
-    return solution.poses, solution.cameras, solution.points, solution.lever_arm
+def _values(of: Problem | Solution) -> tuple[Any, ...]:
+    """Return all that an adjustment may change."""
+    return of.poses, of.cameras, of.points, of.lever_arm, of.position_offset
 
 
 def _start(values: Any, start: int) -> Any:

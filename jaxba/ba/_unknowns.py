@@ -14,23 +14,36 @@ class Step(eqx.Module):
 
     poses: Float[Array | np.ndarray, "images 6"]
     intrinsics: Float[Array | np.ndarray, "cameras parameters"]
-    lever_arm: Float[Array | np.ndarray, "3"]
+    antenna: Float[Array | np.ndarray, " antenna"]
     points: Float[Array | np.ndarray, "points 3"]
 
 
 class Unknowns(eqx.Module):
-    """Values of everything an adjustment may change; fields as in `Problem`, the intrinsics as one array."""
+    """Values of everything an adjustment may change; fields as in `Problem`, the intrinsics as one array.
+
+    `antenna`: the lever arm, then the offset that all measured positions have in common, where the problem has one.
+    """
 
     poses: Pose
     intrinsics: Float[Array | np.ndarray, "cameras parameters"]
-    lever_arm: Float[Array | np.ndarray, "3"]
+    antenna: Float[Array | np.ndarray, " antenna"]
     points: Float[Array | np.ndarray, "points 3"]
+
+    @property
+    def lever_arm(self) -> Float[Array | np.ndarray, "3"]:
+        """From the camera's centre to the antenna, metres, camera frame."""
+        return self.antenna[:3]
+
+    @property
+    def position_offset(self) -> Float[Array | np.ndarray, "offsets 3"]:
+        """Measured minus true positions, metres, world: one row, or none where the problem has no such unknown."""
+        return self.antenna[3:].reshape(-1, 3)
 
     def retract(self, step: Step) -> "Unknowns":
         """Return the unknowns after a step: poses along their tangent, everything else by addition."""
         return Unknowns(
             self.poses.retract(jnp.asarray(step.poses)),
             self.intrinsics + step.intrinsics,
-            self.lever_arm + step.lever_arm,
+            self.antenna + step.antenna,
             self.points + step.points,
         )

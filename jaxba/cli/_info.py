@@ -63,6 +63,7 @@ def facts(problem: Problem) -> dict[str, Any]:
             "points": int(np.count_nonzero(free.points)),
             "intrinsics": {name: int(np.count_nonzero(free_intrinsics[:, i])) for i, name in enumerate(names)},
             "lever_arm": bool(free.lever_arm),
+            "position_offset": bool(free.position_offset),
         },
         "bounds": {
             name: {"lower": float(lower[:, i].min()), "upper": float(upper[:, i].max())}
@@ -102,7 +103,7 @@ def initial_costs(prepared: Prepared) -> dict[str, float]:
         unknowns = Unknowns(
             poses=jax.tree.map(jnp.asarray, problem.poses),
             intrinsics=jnp.asarray(intrinsics(problem)),
-            lever_arm=jnp.asarray(problem.lever_arm),
+            antenna=jnp.asarray(problem.antenna),
             points=jnp.asarray(problem.points),
         )
         for prior in problem.priors:
@@ -172,6 +173,7 @@ def _free_text(found: dict[str, Any]) -> list[str]:
         f"{free['poses']} of {found['num_images']} poses, {free['points']} of {found['num_points']} points",
         f"intrinsics {', '.join(intrinsics_free) or 'none'}{'; fixed ' + ', '.join(fixed) if fixed else ''}",
         f"lever arm {'free' if free['lever_arm'] else 'fixed'}",
+        *(["position offset free"] if free["position_offset"] else []),
     ]
 
 

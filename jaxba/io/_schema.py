@@ -94,6 +94,9 @@ SCHEMA: tuple[ArraySpec, ...] = (
     ),
     ArraySpec(name="free_lever_arm", shape=(), kind="bool", default=False, meaning="the same for the lever arm"),
     ArraySpec(
+        name="free_position_offset", shape=(), kind="bool", default=False, meaning="the same for the position offset"
+    ),
+    ArraySpec(
         name="bounds_lower", shape=("cameras", "parameters"), kind="float64", unit="px, 1", frame="image",
         default=-np.inf, meaning="lower bounds on the intrinsics",
     ),
@@ -105,6 +108,10 @@ SCHEMA: tuple[ArraySpec, ...] = (
         name="lever_arm_m", shape=(3,), kind="float64", unit="m", frame="camera", default=0.0,
         meaning="from the camera's centre to the GNSS antenna, shared by all images",
     ),
+    ArraySpec(
+        name="position_offset_m", shape=(1, 3), kind="float64", unit="m", frame="world", default="",
+        meaning="what measured positions have in common beside their errors, measured minus true",
+    ),
     ArraySpec(name="image_names", shape=("images",), kind="str", default="", meaning="names for messages"),
 )  # fmt: skip
 """The arrays of every tile; those of priors come from `prior_specs`."""
@@ -112,6 +119,7 @@ SCHEMA: tuple[ArraySpec, ...] = (
 _PRIOR_FIELDS = {
     "xyz": ("m", "world", "measured position (position: of the antenna; control: of the point)"),
     "lever_arm_xyz": ("m", "camera", "measured lever arm"),
+    "position_offset_xyz": ("m", "world", "expected offset, mostly zero"),
     "std_m": ("m", "that of xyz", "standard deviation an axis; infinite where it is not measured"),
     "quaternion": ("1", "cam_from_world", "measured rotation, unit quaternion, scalar first"),
     "std_rad": ("rad", "camera", "standard deviation about each axis"),

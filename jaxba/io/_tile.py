@@ -148,10 +148,11 @@ def _problem_from_arrays(a: Mapping[str, np.ndarray]) -> Problem:
         ),
         priors=tuple(_prior(name, a) for name in PRIORS if f"prior_{name}_loss" in a),
         lever_arm=a["lever_arm_m"],
-        free=Free(a["free_poses"], a["free_points"], a["free_intrinsics"], a["free_lever_arm"]),
+        free=Free(**{field.name: a[f"free_{field.name}"] for field in dataclasses.fields(Free)}),
         lower=a["bounds_lower"],
         upper=a["bounds_upper"],
         image_names=tuple(a["image_names"].tolist()) if "image_names" in a else (),
+        position_offset=a.get("position_offset_m", np.zeros((0, 3))),
     )
 
 
@@ -220,6 +221,8 @@ def _arrays_from_problem(problem: Problem, label: str) -> dict[str, np.ndarray]:
         "bounds_upper": problem.upper,
         "lever_arm_m": problem.lever_arm,
     }
+    if len(problem.position_offset):
+        values |= {"free_position_offset": free.position_offset, "position_offset_m": problem.position_offset}
     if problem.image_names:
         values["image_names"] = problem.image_names
     for prior in problem.priors:

@@ -17,7 +17,15 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import AttitudePrior, ControlPointPrior, LeverArmPrior, Observations, PositionPrior, Problem
+from jaxba.ba import (
+    AttitudePrior,
+    ControlPointPrior,
+    LeverArmPrior,
+    Observations,
+    PositionOffsetPrior,
+    PositionPrior,
+    Problem,
+)
 from jaxba.geometry import AbstractCamera, OpenCV, Pose
 from jaxba.simulation._flight import (
     FlightPattern,
@@ -100,6 +108,8 @@ def uav_block(
     gnss_outlier_m: tuple[float, float] = (1.0, 10.0),
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     lever_arm_std_m: float | None = None,
+    position_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    position_offset_std_m: float | None = None,
     attitude_prior: bool = False,
     attitude_error_rad: float = 0.0175,
     position_error_m: float = 0.0,
@@ -134,6 +144,8 @@ def uav_block(
       `gnss_outlier_m` (least, most) in any direction.
     - `lever_arm_m`: camera to antenna, camera frame. `lever_arm_std_m`: None holds it fixed at its true value; a sigma
       frees it, with a prior and a start value that are off by that sigma.
+    - `position_offset_m`: of all GNSS positions in common. `position_offset_std_m`: a sigma makes it an unknown, with a
+      prior of zero and that sigma, and a start value of zero; None leaves it as it is.
 
     The start values: positions from GNSS (without it, the true ones) and `position_error_m` on top; attitudes with a
     sigma of `attitude_error_rad` about each axis, which `attitude_prior` makes a prior too; focal lengths too long by
@@ -178,6 +190,7 @@ def uav_block(
         ("gnss_std_m", gnss_std_m),
         ("control_std_m", control_std_m),
         ("lever_arm_std_m", lever_arm_std_m),
+        ("position_offset_std_m", position_offset_std_m),
         ("attitude_error_rad", attitude_error_rad if attitude_prior else None),
     ):
         if value is not None and not np.all(np.isfinite(value) & (np.asarray(value) > 0)):
@@ -218,6 +231,7 @@ def uav_block(
         gnss_is_outlier = _choose(gnss_rng, np.arange(num_images), num_images, gnss_outlier_fraction)
         antennas += gnss_std_m * gnss_rng.normal(size=antennas.shape)
         antennas += _gross(gnss_rng, gnss_is_outlier, gnss_outlier_m, 3)
+        antennas += np.array(position_offset_m, float)
     surveyed = points[:num_control] + control_std_m * start_rng.normal(size=(num_control, 3))
 
     start_attitudes = Rotation.from_rotvec(attitude_error_rad * start_rng.normal(size=(num_images, 3))) * attitudes
@@ -240,6 +254,8 @@ def uav_block(
         priors.append(ControlPointPrior(point_index=control, xyz=surveyed, std_m=std_m))
     if lever_arm_std_m is not None:
         priors.append(LeverArmPrior(xyz=start_lever_arm[None], std_m=np.full((1, 3), float(lever_arm_std_m))))
+    if position_offset_std_m is not None:
+        priors.append(PositionOffsetPrior(xyz=np.zeros((1, 3)), std_m=np.full((1, 3), float(position_offset_std_m))))
     std_px = np.full(len(measured_px), pixel_std_px or 1.0)
     problem = Problem.build(
         start_poses,
@@ -253,6 +269,9 @@ def uav_block(
     if isinstance(cameras, OpenCV) and not np.any(cameras.k3):
         problem = problem.fix(intrinsics=["k3"])
     problem = eqx.tree_at(lambda p: p.free.lever_arm, problem, np.array(lever_arm_std_m is not None))
+    if position_offset_std_m is not None:
+        offset = np.zeros((1, 3)), np.array(True)
+        problem = eqx.tree_at(lambda p: (p.position_offset, p.free.position_offset), problem, offset)
     truth = Truth(
         poses=_pose(attitudes, centers),
         cameras=cameras,

@@ -28,7 +28,7 @@ from jaxba.geometry import AbstractLoss, Linear, Pose
 def start_of(problem: Problem) -> Unknowns:
     """Return a problem's start values in its own order."""
     parameters = np.stack([getattr(problem.cameras, name) for name in problem.cameras.parameter_names()], axis=-1)
-    return Unknowns(problem.poses, parameters, problem.lever_arm, problem.points)
+    return Unknowns(problem.poses, parameters, problem.antenna, problem.points)
 
 
 def solver_view(
@@ -50,7 +50,7 @@ def in_own_order(step: Step, problem: Problem, plan: Plan) -> Step:
     if plan.shape.own_cameras:
         cameras = np.asarray(problem.camera_index)[plan.image_order]
         intrinsics = intrinsics[: problem.num_images][np.argsort(cameras)]
-    return Step(poses, intrinsics, np.asarray(step.lever_arm), points)
+    return Step(poses, intrinsics, np.asarray(step.antenna), points)
 
 
 class Minimum(NamedTuple):
@@ -81,7 +81,7 @@ class Group(NamedTuple):
 class Dense:
     """A problem around its start values, as functions of the tangent vector of everything that is free.
 
-    - `size`: free unknowns, in the order poses, intrinsics, lever arm, points.
+    - `size`: free unknowns, in the order poses, intrinsics, antenna, points.
     - `lower`, `upper`: bounds of the tangent vector.
     """
 
@@ -91,7 +91,7 @@ class Dense:
         self._masks = (
             np.repeat(free.poses[:, None], 6, axis=1),
             np.asarray(free.intrinsics),
-            np.full(3, bool(free.lever_arm)),
+            problem.free_antenna,
             np.repeat(free.points[:, None], 3, axis=1),
         )
         self._place = np.flatnonzero(np.concatenate([mask.ravel() for mask in self._masks]))
@@ -103,12 +103,12 @@ class Dense:
         self._last: tuple[np.ndarray, list[Group]] | None = None
 
     def _bound(self, default: float, intrinsics: Array) -> np.ndarray:
-        poses, _, lever_arm, points = (np.full(mask.shape, default) for mask in self._masks)
-        return self.flat(Step(poses, intrinsics, lever_arm, points))
+        poses, _, antenna, points = (np.full(mask.shape, default) for mask in self._masks)
+        return self.flat(Step(poses, intrinsics, antenna, points))
 
     def flat(self, step: Step) -> np.ndarray:
         """Return the free entries of a step in the problem's order."""
-        leaves = step.poses, step.intrinsics, step.lever_arm, step.points
+        leaves = step.poses, step.intrinsics, step.antenna, step.points
         return np.concatenate([np.asarray(leaf)[mask] for leaf, mask in zip(leaves, self._masks, strict=True)])
 
     def tangent(self, unknowns: Unknowns) -> np.ndarray:
@@ -120,7 +120,7 @@ class Dense:
             Step(
                 np.concatenate([turn.as_rotvec(), moved], axis=1),
                 unknowns.intrinsics - start.intrinsics,
-                unknowns.lever_arm - start.lever_arm,
+                unknowns.antenna - start.antenna,
                 unknowns.points - start.points,
             )
         )
@@ -206,12 +206,12 @@ _loss_derivatives = quick_jit(lambda loss, squared: loss.derivatives(squared))
 
 
 def _moved(full: Array, start: Unknowns) -> Unknowns:
-    sizes = start.poses.translation.shape[0] * 6, start.intrinsics.size, 3, start.points.size
-    poses, intrinsics, lever_arm, points = jnp.split(full, np.cumsum(sizes)[:-1])
+    sizes = start.poses.translation.shape[0] * 6, start.intrinsics.size, start.antenna.size, start.points.size
+    poses, intrinsics, antenna, points = jnp.split(full, np.cumsum(sizes)[:-1])
     return Unknowns(
         start.poses.retract(poses.reshape(-1, 6)),
         start.intrinsics + intrinsics.reshape(start.intrinsics.shape),
-        start.lever_arm + lever_arm,
+        start.antenna + antenna,
         start.points + points.reshape(-1, 3),
     )
 

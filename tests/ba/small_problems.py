@@ -14,6 +14,7 @@ from jaxba.ba import (
     IntrinsicsPrior,
     LeverArmPrior,
     Observations,
+    PositionOffsetPrior,
     PositionPrior,
     Problem,
 )
@@ -86,6 +87,7 @@ def small_problem(
     num_cameras: int = 1,
     seen_by: int = 4,
     lever_arm: bool = False,
+    position_offset: bool = False,
     num_outliers: int = 0,
     prior_loss: AbstractLoss | None = None,
     at_truth: bool = False,
@@ -155,6 +157,8 @@ def small_problem(
     ]
     if lever_arm:
         priors.append(LeverArmPrior(measured_arm[None], np.full((1, 3), 0.05)))
+    if position_offset:
+        priors.append(PositionOffsetPrior(np.array([[0.02, -0.01, 0.03]]), np.array([[0.05, 0.06, 0.2]])))
 
     off = 0.0 if at_truth else 1.0
     start = Rotation.from_rotvec(off * 0.003 * rng.normal(size=(num_images, 3))) * attitudes
@@ -169,7 +173,11 @@ def small_problem(
         priors=priors,
         lever_arm=measured_arm,
     )
-    return eqx.tree_at(lambda p: p.free.lever_arm, problem, np.array(lever_arm))
+    problem = eqx.tree_at(lambda p: p.free.lever_arm, problem, np.array(lever_arm))
+    if not position_offset:
+        return problem
+    offset = np.array([[0.01, -0.02, 0.04]]), np.array(True)
+    return eqx.tree_at(lambda p: (p.position_offset, p.free.position_offset), problem, offset)
 
 
 def bounded(problem: Problem, half_width: float) -> Problem:

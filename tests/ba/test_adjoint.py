@@ -30,7 +30,9 @@ SIMPLE = EVERY_CAMERA[0]
 TIGHT = {"ftol": 0.0, "xtol": 1e-11, "gtol": 0.0, "max_nfev": 60}
 # at the truth, where the second derivatives are positive definite and the gradient is not zero
 CASES = {
-    "shared camera, every prior": lambda: small_problem(RADIAL, lever_arm=True, prior_loss=Cauchy(2.0), at_truth=True),
+    "shared camera, every prior": lambda: small_problem(
+        RADIAL, lever_arm=True, position_offset=True, prior_loss=Cauchy(2.0), at_truth=True
+    ),
     "two cameras, fixed blocks": lambda: small_problem(RADIAL, num_cameras=2, at_truth=True, seed=2).fix(
         poses=[1], points=[2, 3], intrinsics=["k2"]
     ),
@@ -225,7 +227,7 @@ def test_traced_indices_need_a_plan(block: Problem):
 
 def test_every_input_has_the_derivative_of_central_differences():
     loss = jaxba.Barron(0.5, 2.0)
-    problem = small_problem(SIMPLE, lever_arm=True, num_outliers=3, prior_loss=Cauchy(3.0))
+    problem = small_problem(SIMPLE, lever_arm=True, position_offset=True, num_outliers=3, prior_loss=Cauchy(3.0))
     true = 500.0  # the optimum without bounds is some 2 px off
     problem = eqx.tree_at(lambda p: p.cameras.cx, problem, np.array([true - 9.0]))
     problem = problem.bound(cx=(true - 12.0, true - 6.0)).fix(points=[4], intrinsics=["cy"])
@@ -240,6 +242,7 @@ def test_every_input_has_the_derivative_of_central_differences():
         "position xyz",
         "attitude std_rad",
         "lever_arm std_m",
+        "position_offset std_m",
         "position loss scale",
         "active upper bounds",
         "fixed cy",

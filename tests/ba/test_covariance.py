@@ -46,6 +46,10 @@ CASES = {
         lambda: calibrated(small_block(lever_arm_std_m=0.05, num_control=4, attitude_prior=True)),
         Linear(),
     ),
+    "offset of positions, lever arm held": (
+        lambda: small_block(num_control=4, position_offset_m=(0.4, -0.3, 0.2), position_offset_std_m=0.5),
+        Linear(),
+    ),
     "three cameras, fixed blocks, robust": (
         lambda: partly_fixed(small_block(num_cameras=3, num_control=4, outlier_fraction=0.1)),
         Cauchy(2.0),
@@ -89,7 +93,7 @@ def dense_covariance(problem: Problem, loss: AbstractLoss) -> DenseCovariance:
     scale = 1 / np.linalg.norm(jacobian, axis=0)
     root = np.linalg.inv(np.linalg.qr(jacobian * scale, mode="r")) * scale[:, None]  # no square of the condition
     names = type(problem.cameras).parameter_names()
-    shapes = (problem.num_images, 6), (problem.num_cameras, len(names)), (3,), (problem.num_points, 3)
+    shapes = (problem.num_images, 6), (problem.num_cameras, len(names)), problem.antenna.shape, (problem.num_points, 3)
     ends = np.cumsum([np.prod(shape) for shape in shapes])
     parts = np.split(np.arange(ends[-1]), ends[:-1])
     step = Step(*(part.reshape(shape).astype(float) for part, shape in zip(parts, shapes, strict=True)))
@@ -144,10 +148,13 @@ def test_covariances_equal_a_dense_inverse(case: str, num_tiles: int):
     assert_same(found.poses, dense.of(place.poses))
     assert_same(found.points, dense.of(place.points))
     assert_same(found.intrinsics, dense.of(place.intrinsics))
-    assert_same(found.lever_arm, dense.of(place.lever_arm))
+    assert_same(found.lever_arm, dense.of(place.antenna[:3]))
+    if len(problem.position_offset):
+        assert_same(found.position_offset, dense.of(place.antenna[3:]))
     names = type(problem.cameras).parameter_names()
     by_name = {f"camera {c} {n}": p for c, row in enumerate(place.intrinsics) for n, p in zip(names, row, strict=True)}
-    by_name |= {f"lever arm {axis}": place.lever_arm[i] for i, axis in enumerate("xyz")}
+    names = [f"{of} {axis}" for of in ("lever arm", "position offset") for axis in "xyz"]
+    by_name |= dict(zip(names, place.antenna, strict=False))
     assert_same(found.border, dense.of(np.array([by_name[name] for name in found.border_names], int)))
     assert found.redundancy == dense.redundancy
     assert found.variance_factor == pytest.approx(dense.variance_factor, rel=1e-6)

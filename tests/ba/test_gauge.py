@@ -12,7 +12,14 @@ from small_problems import RADIAL, small_problem
 from jaxba._errors import JaxbaError
 from jaxba.ba import Observations, Problem, free_gauge
 from jaxba.ba.checks._gauge import require_gauge
-from jaxba.ba.groups import AttitudePrior, ControlPointPrior, IntrinsicsPrior, LeverArmPrior, PositionPrior
+from jaxba.ba.groups import (
+    AttitudePrior,
+    ControlPointPrior,
+    IntrinsicsPrior,
+    LeverArmPrior,
+    PositionOffsetPrior,
+    PositionPrior,
+)
 from jaxba.geometry import Pinhole, Pose
 from jaxba.simulation import uav_block
 
@@ -65,9 +72,9 @@ def calibration() -> IntrinsicsPrior:
     return IntrinsicsPrior(camera_index=np.zeros(1, int), parameters=np.ones((1, 4)), std=np.ones((1, 4)))
 
 
-def given(problem: Problem, *priors: object, lever_arm: bool = False) -> Problem:
-    free = dataclasses.replace(problem.free, lever_arm=np.array(lever_arm))
-    return dataclasses.replace(problem, priors=priors, free=free)
+def given(problem: Problem, *priors: object, lever_arm: bool = False, position_offset: bool = False) -> Problem:
+    free = dataclasses.replace(problem.free, lever_arm=np.array(lever_arm), position_offset=np.array(position_offset))
+    return dataclasses.replace(problem, priors=priors, free=free, position_offset=np.zeros((int(position_offset), 3)))
 
 
 CASES = {
@@ -99,6 +106,21 @@ CASES = {
     "hidden position": (lambda p: given(p, positions(p, std_m=np.inf)), ALL),
     "mixed sigmas": (lambda p: given(p, positions(p, std_m=1e-3), attitudes(p, range(8))), ()),
     "free lever arm": (lambda p: given(p, positions(p), lever_arm=True), ()),
+    "free position offset": (
+        lambda p: given(p, positions(p), position_offset=True),
+        tuple(f"translation {a} + position offset {a}" for a in "xyz"),
+    ),
+    "position offset and control": (lambda p: given(p, positions(p), control(p, [3, 8, 20]), position_offset=True), ()),
+    "position offset and a control point": (
+        lambda p: given(p, positions(p), control(p, [3]), lever_arm=True, position_offset=True),
+        (),
+    ),
+    "known position offset": (
+        lambda p: given(
+            p, positions(p), PositionOffsetPrior(np.zeros((1, 3)), np.full((1, 3), 0.5)), position_offset=True
+        ),
+        (),
+    ),
     "idle lever arm": (
         lambda p: given(p.fix(poses=[0, 7]), lever_arm=True),
         ("lever arm x", "lever arm y", "lever arm z"),
@@ -117,9 +139,8 @@ def test_free_directions_are_named(case: str):
 
 def nullity(problem: Problem) -> int:
     """Count the singular directions of the dense Jacobian of everything free, written out by hand."""
-    free = np.concatenate(
-        [np.repeat(problem.free.poses, 6), np.repeat(problem.free.points, 3), np.repeat(problem.free.lever_arm, 3)]
-    )
+    antenna = np.repeat([problem.free.lever_arm, problem.free.position_offset], 3)
+    free = np.concatenate([np.repeat(problem.free.poses, 6), np.repeat(problem.free.points, 3), antenna])
     jacobian = np.concatenate([pixel_rows(problem), *(prior_rows(prior, problem) for prior in problem.priors)])[:, free]
     jacobian /= np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
     values = np.linalg.svd(jacobian, compute_uv=False)
@@ -132,10 +153,10 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def pixel_rows(problem: Problem) -> np.ndarray:
-    """Derivatives of the pixels by steps (w, v) of the poses, points and the lever arm: p' = exp(w)(R x + t) + v."""
+    """Derivatives of the pixels by steps (w, v) of poses, points, lever arm and offset: p' = exp(w)(R x + t) + v."""
     rotation, _ = rotation_and_centers(problem)
     rotation, seen, images = rotation.as_matrix(), problem.observations, problem.num_images
-    rows = np.zeros((len(seen.image_index), 2, images * 6 + problem.num_points * 3 + 3))
+    rows = np.zeros((len(seen.image_index), 2, images * 6 + problem.num_points * 3 + 6))
     for row, i, j in zip(rows, seen.image_index, seen.point_index, strict=True):
         p = rotation[i] @ problem.points[j] + problem.poses.translation[i]
         of_p = 1000.0 / p[2] * np.array([[1, 0, -p[0] / p[2]], [0, 1, -p[1] / p[2]]])
@@ -148,23 +169,23 @@ def pixel_rows(problem: Problem) -> np.ndarray:
 def prior_rows(prior: object, problem: Problem) -> np.ndarray:
     """Derivatives of a prior's residuals by the same steps."""
     images, points = problem.num_images, problem.num_points
-    size = images * 6 + points * 3 + 3
+    size = images * 6 + points * 3 + 6
     if isinstance(prior, IntrinsicsPrior):
         return np.zeros((0, size))
     index = getattr(prior, "image_index", getattr(prior, "point_index", np.zeros(1, int)))
     rows = np.zeros((len(index), 3, size))
     rotation = rotation_and_centers(problem)[0].as_matrix()
     for row, i in zip(rows, index, strict=True):
-        if isinstance(prior, PositionPrior):  # R^T (arm - t), the lever arm being zero
+        if isinstance(prior, PositionPrior):  # R^T (arm - t) + offset, the lever arm being zero
             assert not np.any(problem.lever_arm)
-            row[:, 6 * i + 3 : 6 * i + 6], row[:, -3:] = -rotation[i].T, rotation[i].T
+            row[:, 6 * i + 3 : 6 * i + 6], row[:, -6:-3], row[:, -3:] = -rotation[i].T, rotation[i].T, np.eye(3)
         elif isinstance(prior, AttitudePrior):
             row[:, 6 * i : 6 * i + 3] = np.eye(3)
         elif isinstance(prior, ControlPointPrior):
             row[:, 6 * images + 3 * i : 6 * images + 3 * i + 3] = np.eye(3)
         else:
-            assert isinstance(prior, LeverArmPrior)
-            row[:, -3:] = np.eye(3)
+            assert isinstance(prior, LeverArmPrior | PositionOffsetPrior)
+            row[:, slice(-6, -3) if isinstance(prior, LeverArmPrior) else slice(-3, None)] = np.eye(3)
     sigma = prior.std_rad if isinstance(prior, AttitudePrior) else prior.std_m
     return (rows / sigma[:, :, None]).reshape(-1, size)
 
@@ -250,7 +271,7 @@ ABSURD = (0.0, np.nan, np.inf, 1e308, 1e200, 1e31, 1e30, 1e20, 1e12, 1e-12, 1e-2
 def test_absurd_numbers_are_refused_or_judged():
     """Any number of a problem, or all of an array, is set to or multiplied by an absurd one: nothing else is raised."""
     rng = np.random.default_rng(0)
-    leaves, tree = jax.tree.flatten(small_problem(RADIAL, lever_arm=True))
+    leaves, tree = jax.tree.flatten(small_problem(RADIAL, lever_arm=True, position_offset=True))
     numbers = [i for i, leaf in enumerate(leaves) if np.asarray(leaf).dtype.kind == "f"]
     judged = refused = 0
     for _ in range(150):

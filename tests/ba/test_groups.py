@@ -15,13 +15,13 @@ from jaxba.ba import AbstractPrior, AspectPrior, AttitudePrior, Rows, Step, Unkn
 from jaxba.ba.groups import PRIORS, Reprojection
 from jaxba.geometry import Pose
 
-PROBLEM = small_problem(EVERY_CAMERA[3], num_cameras=2, lever_arm=True)
+PROBLEM = small_problem(EVERY_CAMERA[3], num_cameras=2, lever_arm=True, position_offset=True)
 UNKNOWNS = start_of(PROBLEM)
 
 
 def no_step(unknowns: Unknowns) -> Step:
     poses = np.zeros((unknowns.poses.translation.shape[0], 6))
-    return Step(poses, *(np.zeros(np.shape(x)) for x in (unknowns.intrinsics, unknowns.lever_arm, unknowns.points)))
+    return Step(poses, *(np.zeros(np.shape(x)) for x in (unknowns.intrinsics, unknowns.antenna, unknowns.points)))
 
 
 @quick_jit
@@ -51,8 +51,8 @@ def assert_rows_equal_jacfwd(prior: AbstractPrior, unknowns: Unknowns, tolerance
             dense[:, numbers, block.index] = np.moveaxis(block.jacobian, 1, 2)
         # 1e-12 of the largest entry: rounding of two orders of summation
         np.testing.assert_allclose(dense, whole, rtol=0, atol=tolerance * max(1.0, np.abs(whole).max()))
-    lever_arm = np.zeros(expected.lever_arm.shape) if rows.lever_arm is None else np.moveaxis(rows.lever_arm, 1, 2)
-    np.testing.assert_allclose(lever_arm, expected.lever_arm, rtol=0, atol=1e-12 * max(1.0, np.abs(lever_arm).max()))
+    antenna = np.zeros(expected.antenna.shape) if rows.antenna is None else np.moveaxis(rows.antenna, 1, 2)
+    np.testing.assert_allclose(antenna, expected.antenna, rtol=0, atol=1e-12 * max(1.0, np.abs(antenna).max()))
     for reverse, whole in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
         forward = 2 * np.einsum("rc,rc...->...", value, whole)
         np.testing.assert_allclose(reverse, forward, rtol=0, atol=tolerance * max(1.0, np.abs(forward).max()))
@@ -90,7 +90,7 @@ def test_derivatives_of_an_attitude_equal_jacfwd_from_no_turn_to_half_a_turn(ang
 def test_residuals_of_priors_equal_their_formulas():
     rotation = Rotation.from_quat(UNKNOWNS.poses.quaternion, scalar_first=True)
     position, attitude, control = (PROBLEM.prior(name) for name in ("position", "attitude", "control"))
-    centers = rotation.inv().apply(UNKNOWNS.lever_arm - UNKNOWNS.poses.translation)
+    centers = rotation.inv().apply(UNKNOWNS.lever_arm - UNKNOWNS.poses.translation) + UNKNOWNS.position_offset
     expected = {
         "position": (centers[position.image_index] - position.xyz) / position.std_m,
         "attitude": (
@@ -173,6 +173,6 @@ def test_rows_of_infinite_sigma_weigh_nothing_and_keep_derivatives_finite(name):
 
     residual, _, gradient, rows = jax.device_get(evaluate(padded, UNKNOWNS))
     touched = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
-    assert touched or rows.lever_arm is not None
-    for leaf in jax.tree.leaves((residual, gradient, rows.residual, rows.lever_arm, touched)):
+    assert touched or rows.antenna is not None
+    for leaf in jax.tree.leaves((residual, gradient, rows.residual, rows.antenna, touched)):
         assert np.all(leaf == 0)

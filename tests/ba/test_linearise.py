@@ -82,7 +82,7 @@ def assert_model_is_dense(problem: Problem, loss: AbstractLoss, bend: float) -> 
 @pytest.mark.parametrize("bend", [0.0, 0.9])
 @pytest.mark.parametrize("index", range(len(LOSSES)), ids=lambda i: repr(LOSSES[i]))
 def test_model_of_every_loss_is_the_dense_one(index, bend):
-    problem = small_problem(RADIAL, lever_arm=True, prior_loss=Cauchy(3.0), num_outliers=3)
+    problem = small_problem(RADIAL, lever_arm=True, position_offset=True, prior_loss=Cauchy(3.0), num_outliers=3)
     assert_model_is_dense(problem, one_of(index), bend)
 
 

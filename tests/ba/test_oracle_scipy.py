@@ -61,7 +61,7 @@ def test_optimum_within_wide_bounds_equals_scipy():
 
 
 def free_network() -> Problem:
-    return small_problem(RADIAL, lever_arm=True, prior_loss=Cauchy(3.0), num_outliers=3)
+    return small_problem(RADIAL, lever_arm=True, position_offset=True, prior_loss=Cauchy(3.0), num_outliers=3)
 
 
 def bounded_pair() -> Problem:

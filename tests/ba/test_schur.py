@@ -28,7 +28,9 @@ def partly_fixed(problem: Problem) -> Problem:
 
 
 def strip(**options: Any) -> Problem:
-    return small_problem(RADIAL, num_images=26, num_points=60, seen_by=3, lever_arm=True, **options)
+    return small_problem(
+        RADIAL, num_images=26, num_points=60, seen_by=3, lever_arm=True, position_offset=True, **options
+    )
 
 
 def own_cameras() -> Problem:

@@ -117,7 +117,7 @@ def places(problem: Problem, dense: Dense) -> tuple[np.ndarray, np.ndarray]:
 
     A camera's position moves by as much as its translation does, in another direction.
     """
-    sizes = (problem.num_images, 6), problem.free.intrinsics.shape, (3,), (problem.num_points, 3)
+    sizes = (problem.num_images, 6), problem.free.intrinsics.shape, problem.antenna.shape, (problem.num_points, 3)
     ends = np.cumsum([int(np.prod(size)) for size in sizes])
     number = np.arange(ends[-1]) + 1.0
     step = Step(*(part.reshape(size) for part, size in zip(np.split(number, ends[:-1]), sizes, strict=True)))

@@ -31,7 +31,12 @@ _BLOCK = functools.partial(jaxba.synthetic.uav_block, 60, side_overlap=0.7, poin
 def everything() -> Problem:
     """One shared camera, GNSS under a robust loss with bad fixes, control, a free lever arm, an active bound."""
     survey = _BLOCK(
-        outlier_fraction=0.03, lever_arm_m=(0.1, 0.2, 0.1), lever_arm_std_m=0.05, gnss_outlier_fraction=0.05
+        outlier_fraction=0.03,
+        lever_arm_m=(0.1, 0.2, 0.1),
+        lever_arm_std_m=0.05,
+        gnss_outlier_fraction=0.05,
+        position_offset_m=(0.5, -0.4, 0.3),
+        position_offset_std_m=1.0,
     )
     problem = survey.problem.bound(k1=(-0.03, 0.03))
     priors = [dataclasses.replace(p, loss=Cauchy(3.0)) if p.name == "position" else p for p in problem.priors]
@@ -211,6 +216,7 @@ def test_steps_and_solution_are_those_of_the_block_in_one_piece(kind: str, num_t
         for name in whole.cameras.parameter_names():
             np.testing.assert_allclose(getattr(tiled.cameras, name), getattr(whole.cameras, name), rtol=1e-7, atol=1e-9)
         np.testing.assert_allclose(tiled.lever_arm, whole.lever_arm, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(tiled.position_offset, whole.position_offset, rtol=0, atol=1e-7)
     if kind == "everything":
         assert tiled.cameras.k1 == -0.03  # the bound is active
 

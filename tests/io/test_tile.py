@@ -35,7 +35,7 @@ def random_prior(name: str, parameters: int, rng: np.random.Generator):
             else unit(rng, shape[0]) if spec.unit_norm
             else rng.normal(size=shape)
         )  # fmt: skip
-    loss = list(LOSSES.values())[list(PRIORS).index(name) + 3]
+    loss = list(LOSSES.values())[(list(PRIORS).index(name) + 3) % len(LOSSES)]
     return PRIORS[name](**values, loss=loss(f_scale=2.5) if loss is not Barron else Barron(alpha=-0.5, f_scale=2.5))
 
 
@@ -60,7 +60,9 @@ def random_problem(model: str = "OPENCV", priors: tuple[str, ...] = tuple(PRIORS
             rng.random(POINTS) < 0.5,
             rng.random((CAMERA_COUNT, parameters)) < 0.5,
             np.array(True),
+            np.array(True),
         ),
+        position_offset=rng.normal(size=(1, 3)),
         lower=np.where(rng.random((CAMERA_COUNT, parameters)) < 0.5, -np.inf, -9.0),
         upper=np.where(rng.random((CAMERA_COUNT, parameters)) < 0.5, np.inf, 9.0),
         image_names=tuple(f"DJI_{i}_ä.JPG" for i in range(IMAGES)),

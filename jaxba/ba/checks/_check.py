@@ -202,7 +202,7 @@ def prepare(problem: Problem) -> Prepared:
 
     free_points[loose], free_poses[idle_images], free_intrinsics[idle_cameras] = False, False, False
     free_intrinsics[open_intrinsics] = False
-    if not (free_points.any() or free_poses.any() or free_intrinsics.any() or np.any(free.lever_arm)):
+    if not (free_points.any() or free_poses.any() or free_intrinsics.any() or problem.free_antenna.any()):
         summary = "; ".join(dropped.summary())
         raise JaxbaError(f"Nothing that is free is measured: {summary}. Free more, or measure more.")
     held = {"image_index": idle_images, "point_index": loose, "camera_index": idle_cameras}
@@ -210,7 +210,7 @@ def prepare(problem: Problem) -> Prepared:
     changed = dataclasses.replace(
         problem,
         observations=observations,
-        free=Free(free_poses, free_points, free_intrinsics, free.lever_arm),
+        free=Free(free_poses, free_points, free_intrinsics, free.lever_arm, free.position_offset),
         priors=tuple(_without_effect(prior, held) for prior in problem.priors),
     )
     return Prepared(changed, dropped, kept)

@@ -6,9 +6,9 @@ about the block's middle and in units of its size, and J the rows of all priors 
 
     free directions = null space of (J D)^T (J D)
 
-A free lever arm adds three columns: in a block without turns it moves as a translation of the block does. Parts of a
-block that share no free pose or point are looked at one by one. Robust losses do not count: they weaken rows, and a row
-that has levelled off at the start values may come back.
+A free lever arm adds three columns, as does a free offset of all positions: in a block without turns they move as a
+translation of the block does. Parts of a block that share no free pose or point are looked at one by one. Robust losses
+do not count: they weaken rows, and a row that has levelled off at the start values may come back.
 
 Cost: numpy, and the priors' own derivatives in jitted pieces of `_CHUNK` rows, which compile once whatever the problem
 (0.3 s a prior). 2000 images with 500k observations take 0.1 s after that.
@@ -38,9 +38,9 @@ _NEGLIGIBLE = 0.1  # of a direction's largest component: smaller ones are not na
 
 _NAMES = (
     *(f"translation {a}" for a in "xyz"), *(f"rotation about {a}" for a in "xyz"), "scale",
-    *(f"lever arm {a}" for a in "xyz"),
+    *(f"lever arm {a}" for a in "xyz"), *(f"position offset {a}" for a in "xyz"),
 )  # fmt: skip
-_TURNING, _MOVING = (3, 4, 5, 6), (0, 1, 2, 7, 8, 9)
+_TURNING, _MOVING = (3, 4, 5, 6), (0, 1, 2, *range(7, 13))
 
 
 def free_gauge(problem: Problem) -> tuple[str, ...]:
@@ -48,7 +48,8 @@ def free_gauge(problem: Problem) -> tuple[str, ...]:
 
     `translation x`, `rotation about z`, `scale`, ...: one name a free direction, in the world's axes. A rotation about
     a line that is no axis is named by the axes it is made of, `rotation about x + rotation about y`; the centre of a
-    rotation or of the scaling is not told. `lever arm z` appears where a free lever arm is not determined.
+    rotation or of the scaling is not told. `lever arm z` appears where a free lever arm is not determined, and
+    `position offset z` likewise.
 
     Raises `JaxbaError` where the problem contradicts itself or holds impossible values.
 
@@ -59,12 +60,16 @@ def free_gauge(problem: Problem) -> tuple[str, ...]:
     """
     validate(problem)
     parts = Parts.of(problem)
-    normal, lever_prior = _normal_matrices(problem, parts)
-    columns = 10 if problem.free.lever_arm and not _lever_arm_determined(normal, lever_prior) else 7
-    if columns == 10:
-        normal[:, 7:, 7:] += lever_prior
-    vectors, free = _null(normal[:, :columns, :columns])
-    names = {name for part in np.flatnonzero(free.any(axis=1)) for name in _names(vectors[part][:, free[part]].T)}
+    normal, of_antenna = _normal_matrices(problem, parts)
+    columns = np.arange(7)
+    antenna = 7 + np.flatnonzero(problem.free_antenna)
+    if len(antenna) and not _antenna_determined(normal, of_antenna, antenna):
+        normal[:, 7:, 7:] += of_antenna
+        columns = np.concatenate([columns, antenna])
+    vectors, free = _null(normal[:, columns[:, None], columns])
+    names = {
+        name for part in np.flatnonzero(free.any(axis=1)) for name in _names(vectors[part][:, free[part]].T, columns)
+    }
     return tuple(sorted(names, key=lambda name: [_NAMES.index(n) for n in name.split(" + ")]))
 
 
@@ -77,52 +82,56 @@ def require_gauge(problem: Problem, purpose: str) -> None:
     cures = ["Add a position prior with finite std_m or three control points, or fix two poses."]
     if all(name.startswith("rotation") for name in free):
         cures = ["Positions along one line leave the turn about it: add a control point off it or an attitude prior."]
-    if any("lever arm" in name for name in free):
-        cures = ["Hold the lever arm fixed or add a lever arm prior with finite std_m.", *cures]
-        cures = cures[: 1 if all("lever arm" in name for name in free) else 2]
+    for unknown in ("lever arm", "position offset"):
+        if any(unknown in name for name in free):
+            cures = [f"Hold the {unknown} fixed or add a {unknown} prior with finite std_m.", *cures]
+            cures = cures[: 1 if all(unknown in name for name in free) else 2]
     raise JaxbaError(f"{purpose}: problem has no gauge, {count} free ({', '.join(free)}). {' '.join(cures)}")
 
 
 def _normal_matrices(
     problem: Problem, parts: Parts
-) -> tuple[Float[np.ndarray, "parts 10 10"], Float[np.ndarray, "3 3"]]:
-    """Return (J D)^T (J D) of each part, the lever arm in the last three columns, and the lever arm's own prior.
+) -> tuple[Float[np.ndarray, "parts n n"], Float[np.ndarray, "antenna antenna"]]:
+    """Return (J D)^T (J D) of each part, the antenna in the last columns, and that of the antenna's own priors.
 
     Every group of rows is divided by its trace, so that its sigmas' unit does not matter.
     """
-    normal = np.zeros((len(parts.size), 10, 10))
-    lever_prior = np.zeros((3, 3))
+    free_antenna = problem.free_antenna
+    size = 7 + len(free_antenna)
+    normal = np.zeros((len(parts.size), size, size))
+    of_antenna = np.zeros((len(free_antenna),) * 2)
     normal[:, :7, :7] += _fixed_point_grams(problem, parts)
     part, index = parts.fixed_poses
     moved = parts.move_poses(part, _poses(problem, index))
     moved[:, 3:] /= parts.size[part][:, None, None]
-    normal += _grams(moved, part, len(parts.size))
+    normal += _grams(moved, part, len(parts.size), size)
     for prior in problem.priors:
-        if not problem.free.lever_arm and not _null(normal[:, :7, :7])[1].any():
+        if not free_antenna.any() and not _null(normal[:, :7, :7])[1].any():
             break  # all is held already: the other priors need not be compiled
         rows = prior_rows(prior, problem)
         if rows is None:
             continue
         if rows.pose is None and rows.point is None:
-            if rows.lever_arm is not None:
-                lever = np.asarray(rows.lever_arm).reshape(-1, 3)
-                lever_prior = lever.T @ lever / max(np.sum(lever**2), np.finfo(float).tiny)
+            if rows.antenna is not None:
+                along = np.moveaxis(np.asarray(rows.antenna), 2, 0).reshape(-1, len(free_antenna))
+                of_antenna += along.T @ along / max(np.sum(along**2), np.finfo(float).tiny)
             continue
         image, point = getattr(prior, "image_index", None), getattr(prior, "point_index", None)
         part = parts.of_image[np.asarray(image)] if rows.pose is not None else parts.of_point[np.asarray(point)]
         inside = part >= 0
         part = part[inside]
-        along = np.zeros((len(part), rows.residual.shape[0], 10))
+        along = np.zeros((len(part), rows.residual.shape[0], size))
         if rows.pose is not None:
             jacobian = np.moveaxis(np.asarray(rows.pose.jacobian), 2, 0)[inside]
             along[:, :, :7] += jacobian @ parts.move_poses(part, _poses(problem, np.asarray(image)[inside]))
         if rows.point is not None:
             jacobian = np.moveaxis(np.asarray(rows.point.jacobian), 2, 0)[inside]
             along[:, :, :7] += jacobian @ parts.move_points(part, np.asarray(problem.points)[np.asarray(point)[inside]])
-        if rows.lever_arm is not None:
-            along[:, :, 7:] = np.moveaxis(np.asarray(rows.lever_arm), 2, 0)[inside] * parts.size[part][:, None, None]
-        normal += _grams(along, part, len(parts.size))
-    return normal, lever_prior
+        if rows.antenna is not None:
+            along[:, :, 7:] = np.moveaxis(np.asarray(rows.antenna), 2, 0)[inside] * parts.size[part][:, None, None]
+            along[:, :, 7:] *= free_antenna
+        normal += _grams(along, part, len(parts.size), size)
+    return normal, of_antenna
 
 
 def _fixed_point_grams(problem: Problem, parts: Parts) -> Float[np.ndarray, "parts 7 7"]:
@@ -151,19 +160,30 @@ def _null(normal: Float[np.ndarray, "parts n n"]) -> tuple[Float[np.ndarray, "pa
     return vectors, values <= _NULL * values[:, -1:]
 
 
-def _lever_arm_determined(normal: Float[np.ndarray, "parts 10 10"], lever_prior: Float[np.ndarray, "3 3"]) -> bool:
-    """Whether the lever arm, which all parts share, is fixed when every part moves freely: its Schur complement."""
-    block, cross, lever = normal[:, :7, :7], normal[:, :7, 7:], normal[:, 7:, 7:]
+def _antenna_determined(
+    normal: Float[np.ndarray, "parts n n"],
+    of_antenna: Float[np.ndarray, "antenna antenna"],
+    free: Int[np.ndarray, " m"],
+) -> bool:
+    """Whether what is free of the antenna, which all parts share, is fixed when every part moves: its Schur complement.
+
+    - `free`: its columns.
+    """
+    block, cross, own = normal[:, :7, :7], normal[:, :7, free], normal[:, free[:, None], free]
     inverse = np.linalg.pinv(block, rcond=_NULL, hermitian=True)
-    schur = lever_prior + np.sum(lever - np.swapaxes(cross, 1, 2) @ inverse @ cross, axis=0)
+    schur = of_antenna[free[:, None] - 7, free - 7]
+    schur = schur + np.sum(own - np.swapaxes(cross, 1, 2) @ inverse @ cross, axis=0)
     return bool(np.linalg.eigvalsh(schur)[0] > _NULL)
 
 
-def _names(null: Float[np.ndarray, "free columns"]) -> list[str]:
-    """Name a null space: a basis by elimination, rotations and scale first, which hide the translations they bring."""
+def _names(null: Float[np.ndarray, "free columns"], of_columns: Int[np.ndarray, " columns"]) -> list[str]:
+    """Name a null space: a basis by elimination, rotations and scale first, which hide the translations they bring.
+
+    - `of_columns`: which of all directions each column is.
+    """
     rows, done, names = null.copy(), 0, []
-    for columns in (_TURNING, _MOVING):
-        columns = [c for c in columns if c < rows.shape[1]]
+    for directions in (_TURNING, _MOVING):
+        columns = [c for c, direction in enumerate(of_columns) if direction in directions]
         pivots = []
         while done < len(rows):
             block = np.abs(rows[done:, columns])
@@ -179,7 +199,7 @@ def _names(null: Float[np.ndarray, "free columns"]) -> list[str]:
         for pivot in pivots:
             size = np.abs(rows[pivot, columns])
             kept = [c for c, s in zip(columns, size, strict=True) if s > _NEGLIGIBLE * size.max()]
-            names.append(" + ".join(_NAMES[c] for c in sorted(kept)))
+            names.append(" + ".join(_NAMES[of_columns[c]] for c in sorted(kept)))
     return names
 
 
@@ -212,7 +232,7 @@ def prior_rows(prior: AbstractPrior, problem: Problem) -> Rows | None:
 @fast_jit
 def _of_geometry(prior: AbstractPrior, unknowns: Unknowns) -> Rows:
     rows = prior.rows(unknowns)
-    return Rows(residual=rows.residual, pose=rows.pose, lever_arm=rows.lever_arm, point=rows.point)
+    return Rows(residual=rows.residual, pose=rows.pose, antenna=rows.antenna, point=rows.point)
 
 
 def _unknowns(problem: Problem, images: Int[np.ndarray, " n"], points: Int[np.ndarray, " m"]) -> Unknowns:
@@ -222,7 +242,7 @@ def _unknowns(problem: Problem, images: Int[np.ndarray, " n"], points: Int[np.nd
     return Unknowns(
         poses=jax.tree.map(array, _poses(problem, images)),
         intrinsics=jax.numpy.zeros((1, len(type(problem.cameras).parameter_names()))),
-        lever_arm=array(problem.lever_arm),
+        antenna=array(problem.antenna),
         points=array(np.asarray(problem.points)[points]),
     )
 
@@ -233,14 +253,14 @@ def _poses(problem: Problem, images: Int[np.ndarray, " n"]) -> Pose:
 
 
 def _grams(
-    along: Float[np.ndarray, "n rows columns"], part: Int[np.ndarray, " n"], count: int
-) -> Float[np.ndarray, "parts 10 10"]:
-    """Return the sum of `A^T A` over each part's entries, with a trace of one (or zero)."""
+    along: Float[np.ndarray, "n rows columns"], part: Int[np.ndarray, " n"], count: int, size: int
+) -> Float[np.ndarray, "parts size size"]:
+    """Return the sum of `A^T A` over each part's entries, with a trace of one (or zero), in the first columns."""
     columns = along.shape[2]
     products = (np.swapaxes(along, 1, 2) @ along).reshape(len(part), columns**2)
     adder = sparse.csr_array((np.ones(len(part)), (part, np.arange(len(part)))), shape=(count, len(part)))
     summed = (adder @ products).reshape(count, columns, columns)
     trace = np.trace(summed, axis1=1, axis2=2)
-    out = np.zeros((count, 10, 10))
+    out = np.zeros((count, size, size))
     out[:, :columns, :columns] = summed / np.where(trace > 0, trace, 1.0)[:, None, None]
     return out

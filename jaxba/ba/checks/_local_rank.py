@@ -258,7 +258,7 @@ def _camera_rows(prior: AbstractPrior, problem: Problem) -> Float[np.ndarray, "r
     with jax.enable_x64(True):
         values = np.stack([np.asarray(getattr(problem.cameras, name), float) for name in names], axis=-1)
         poses, points = jax.tree.map(jax.numpy.asarray, (problem.poses, np.asarray(problem.points, float)))
-        unknowns = Unknowns(poses, jax.numpy.asarray(values), jax.numpy.asarray(problem.lever_arm), points)
+        unknowns = Unknowns(poses, jax.numpy.asarray(values), jax.numpy.asarray(problem.antenna), points)
         fields = {f.name: np.asarray(getattr(prior, f.name)) for f in dataclasses.fields(prior) if f.name != "loss"}
         rows = dataclasses.replace(prior, **fields).rows(unknowns)
     if rows.intrinsics is None:

@@ -45,6 +45,7 @@ def validate(problem: Problem) -> None:
     _check_shape("observations.xy_px", seen.xy_px, "observations 2", sizes)
     _check_shape("observations.std_px", seen.std_px, "observations", sizes)
     _check_shape("lever_arm", problem.lever_arm, "3", sizes)
+    _check_shape("position_offset", problem.position_offset, "1 3" if len(problem.position_offset) else "0 3", sizes)
     _check_shape("lower", problem.lower, "cameras parameters", sizes)
     _check_shape("upper", problem.upper, "cameras parameters", sizes)
     for field, value, dims in (
@@ -52,6 +53,7 @@ def validate(problem: Problem) -> None:
         ("points", free.points, "points"),
         ("intrinsics", free.intrinsics, "cameras parameters"),
         ("lever_arm", free.lever_arm, ""),
+        ("position_offset", free.position_offset, ""),
     ):
         _check_shape(f"free.{field}", value, dims, sizes)
         if np.asarray(value).dtype != bool:
@@ -70,13 +72,16 @@ def validate(problem: Problem) -> None:
     _check_finite("observations.std_px", seen.std_px, observation)
     _check_positive("observations.std_px", seen.std_px, observation)
     _check_finite("lever_arm", problem.lever_arm, _label(problem, "axis"))
+    _check_finite("position_offset", problem.position_offset, _label(problem, "offset"))
+    if free.position_offset and not len(problem.position_offset):
+        raise JaxbaError("free.position_offset is True, but position_offset has no row; give it zeros((1, 3)).")
     _check_duplicates(problem)
     _check_bounds(problem)
     for i, prior in enumerate(problem.priors):
         if any(other.name == prior.name for other in problem.priors[:i]):
             raise JaxbaError(f"prior {prior.name} is given twice; join its rows into one prior.")
         _check_prior(problem, prior, sizes)
-    if not (np.any(free.poses) or np.any(free.points) or np.any(free.intrinsics) or np.any(free.lever_arm)):
+    if not (np.any(free.poses) or np.any(free.points) or np.any(free.intrinsics) or problem.free_antenna.any()):
         raise JaxbaError("Nothing is free, so there is nothing to adjust. Free the poses, points or intrinsics.")
     if sizes["observations"] == 0:
         raise JaxbaError("observations are empty; an adjustment needs points measured in images.")

@@ -7,14 +7,14 @@ from jaxba.ba.groups._control import ControlPointPrior
 from jaxba.ba.groups._intrinsics import IntrinsicsPrior
 from jaxba.ba.groups._lever_arm import LeverArmPrior
 from jaxba.ba.groups._position import PositionPrior
+from jaxba.ba.groups._position_offset import PositionOffsetPrior
 from jaxba.ba.groups._reprojection import Reprojection
 
-PRIORS: dict[str, type[AbstractPrior]] = {
-    prior.name: prior for prior in (PositionPrior, AttitudePrior, IntrinsicsPrior, ControlPointPrior, LeverArmPrior)
-}
+_IN_FILES = PositionPrior, AttitudePrior, IntrinsicsPrior, ControlPointPrior, LeverArmPrior, PositionOffsetPrior
+PRIORS: dict[str, type[AbstractPrior]] = {prior.name: prior for prior in _IN_FILES}
 """Every prior that a file can hold, by name; `tile.npz` and messages are driven by this table."""
 
 __all__ = [
-    "PRIORS", "AspectPrior", "AttitudePrior", "ControlPointPrior", "IntrinsicsPrior", "LeverArmPrior", "PositionPrior",
-    "Reprojection",
+    "PRIORS", "AspectPrior", "AttitudePrior", "ControlPointPrior", "IntrinsicsPrior", "LeverArmPrior",
+    "PositionOffsetPrior", "PositionPrior", "Reprojection",
 ]  # fmt: skip

@@ -26,6 +26,6 @@ class LeverArmPrior(AbstractPrior):
         return ((jnp.asarray(unknowns.lever_arm)[None] - self.xyz) / jnp.asarray(self.std_m)).T
 
     def rows(self, unknowns: Unknowns) -> Rows:
-        identity = jnp.eye(3, dtype=unknowns.lever_arm.dtype)
-        derivative = identity[:, :, None] / jnp.asarray(self.std_m).T[:, None]
-        return Rows(residual=self.residual(unknowns), lever_arm=derivative)
+        by_antenna = jnp.eye(3, len(unknowns.antenna), dtype=unknowns.antenna.dtype)
+        derivative = by_antenna[:, :, None] / jnp.asarray(self.std_m).T[:, None]
+        return Rows(residual=self.residual(unknowns), antenna=derivative)

@@ -1,6 +1,6 @@
-"""Position priors: GNSS positions of the antenna, with a sigma an axis and a lever arm.
+"""Position priors: GNSS positions of the antenna, with a sigma an axis, a lever arm, and an offset that all share.
 
-    r = (C + R^T l - g) / sigma,   C = -R^T t
+    r = (C + R^T l + d - g) / sigma,   C = -R^T t
 
 With the step (w, v) on the left of the pose, `dC/dw = 0`, `dC/dv = -R^T`, `d(R^T l)/dw = R^T [l]_x`, `d/dl = R^T`.
 """
@@ -36,12 +36,14 @@ class PositionPrior(AbstractPrior):
         rotation = rotation_rows(unknowns.poses.rotation, jnp.asarray(self.image_index))
         translation = rows_of(unknowns.poses.translation, self.image_index).T
         antenna = jnp.einsum("jin,jn->in", rotation, unknowns.lever_arm[:, None] - translation)
-        return (antenna - jnp.asarray(self.xyz).T) / jnp.asarray(self.std_m).T
+        offset = jnp.sum(jnp.asarray(unknowns.position_offset), axis=0)  # of no rows: zero
+        return (antenna + offset[:, None] - jnp.asarray(self.xyz).T) / jnp.asarray(self.std_m).T
 
     def rows(self, unknowns: Unknowns) -> Rows:
         rotation = rotation_rows(unknowns.poses.rotation, jnp.asarray(self.image_index))
         transposed = jnp.swapaxes(rotation, 0, 1) / jnp.asarray(self.std_m).T[:, None]
         x, y, z = unknowns.lever_arm
+        by_offset = jnp.eye(3, dtype=transposed.dtype)[:, :, None] / jnp.asarray(self.std_m).T[:, None]
         # R^T [l]_x, column by column
         turn = [
             transposed[:, 1] * z - transposed[:, 2] * y,
@@ -51,5 +53,5 @@ class PositionPrior(AbstractPrior):
         return Rows(
             residual=self.residual(unknowns),
             pose=JacobianBlock(self.image_index, jnp.concatenate([jnp.stack(turn, axis=1), -transposed], axis=1)),
-            lever_arm=transposed,
+            antenna=jnp.concatenate([transposed, *[by_offset] * len(unknowns.position_offset)], axis=1),
         )

@@ -49,7 +49,7 @@ class Tile:
     def take(self, unknowns: Unknowns) -> Unknowns:
         """Return the tile's part of all unknowns, in its solver's order."""
         poses = Pose(unknowns.poses.quaternion[self.images], unknowns.poses.translation[self.images])
-        of_tile = Unknowns(poses, unknowns.intrinsics[self.cameras], unknowns.lever_arm, unknowns.points[self.points])
+        of_tile = Unknowns(poses, unknowns.intrinsics[self.cameras], unknowns.antenna, unknowns.points[self.points])
         return arrange(of_tile, self.plan)
 
     def bare(self) -> "Tile":
@@ -173,7 +173,9 @@ def sub_problem(
             np.asarray(free.points)[points],
             np.asarray(free.intrinsics)[cameras],
             free.lever_arm,
+            free.position_offset,
         ),
         lower=np.asarray(problem.lower)[cameras],
         upper=np.asarray(problem.upper)[cameras],
+        position_offset=np.asarray(problem.position_offset),
     )

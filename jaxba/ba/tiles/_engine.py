@@ -69,7 +69,7 @@ class Engine(TileWork):
         of_unknowns = Step(
             np.repeat(np.asarray(free.poses, float)[:, None], 6, axis=1),
             np.asarray(free.intrinsics, float),
-            np.full(3, float(free.lever_arm)),
+            problem.free_antenna.astype(float),
             np.zeros((0, 3)),
         )
         shelves = Shelf(budget.shelf, folder), Shelf(budget.models)
@@ -91,6 +91,10 @@ class Engine(TileWork):
         self.lower, self.upper = np.asarray(problem.lower, float), np.asarray(problem.upper, float)
         below = {node for _, fronts in self.tiles for node in range(fronts.first, fronts.last)}
         self.tops = [number for number in range(len(tree.nodes)) if number not in below]
+        first = np.full(problem.num_images, len(self.tiles))
+        for number in reversed(range(len(self.tiles))):
+            first[self.tiles[number][0].images] = number
+        self.first_tile = first  # of each image
         self.tile_of_node = {fronts.last: number for number, (_, fronts) in enumerate(self.tiles)}
 
     def tile(self, number: int) -> tuple[Tile, TileFronts]:
@@ -143,7 +147,7 @@ class Engine(TileWork):
                 for total, part in ((gradient, found.gradient), (squares, found.squares)):
                     total.poses[tile.order] += part.poses
                     total.intrinsics[tile.solver_cameras] += part.intrinsics
-                    total.lever_arm[:] += part.lever_arm
+                    total.antenna[:] += part.antenna
                 continue
             node = self.tree.nodes[number]
             images, _ = self.reduced(self.damping(squares, damping), self.camera_index)
@@ -165,6 +169,26 @@ class Engine(TileWork):
             if number not in self.tile_of_node:
                 self.fronts.put_back(number, self.factor(number), solution, tail)
         return solution, tail
+
+    def part_of(self, along: Step, number: int) -> Step:
+        """Return a tile's part of a right-hand side, in its solver's order: parts of all tiles add up to the whole.
+
+        A tile has its points, the images and own cameras that no tile before it has, and the first what all share.
+        """
+        tile, _ = self.tiles[number]
+        shape, count = tile.plan.shape, len(tile.order)
+        mine = (self.first_tile == number)[tile.order, None]
+        poses, points = np.zeros((shape.num_images, 6)), np.zeros((shape.num_points, 3))
+        intrinsics = np.zeros((shape.num_cameras, along.intrinsics.shape[1]))
+        poses[:count] = along.poses[tile.order] * mine
+        cameras = tile.solver_cameras
+        if self.shape.own_cameras:
+            own = self.first_tile[np.argsort(self.camera_index)[cameras]] == number
+            intrinsics[: len(cameras)] = along.intrinsics[cameras] * own[:, None]
+        elif number == 0:
+            intrinsics[:] = along.intrinsics[cameras]
+        points[: len(tile.points)] = along.points[tile.points[tile.plan.point_order]]
+        return Step(poses, intrinsics, along.antenna if number == 0 else np.zeros_like(along.antenna), points)
 
     def each_part(self, name: str, unknowns: Unknowns, *arguments: Any) -> Iterator[Any]:
         """Yield what a method of `TileWork` gives for each tile, wherever that is worked on, in order.

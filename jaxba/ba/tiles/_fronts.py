@@ -121,12 +121,12 @@ class _Memory:
 class Fronts:
     """The structure of all fronts of a tree.
 
-    - `block`, `border`: unknowns of an image, and shared ones.
+    - `block`, `border`: unknowns of an image, and shared ones. `columns`: right-hand sides.
     """
 
-    def __init__(self, tree: Tree, block: int, border: int) -> None:
+    def __init__(self, tree: Tree, block: int, border: int, columns: int = 1) -> None:
         self.tree, self.block, self.border = tree, block, border
-        self.tail = tail_size(block, border)
+        self.tail = tail_size(block, border, columns)
         self.ranks = [tree.rank[np.concatenate([node.eliminated, node.boundary])] for node in tree.nodes]
         self.own = [len(node.eliminated) for node in tree.nodes]
         parent = np.full(len(tree.nodes), -1)

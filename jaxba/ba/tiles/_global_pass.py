@@ -80,7 +80,7 @@ def adjust_shared(
     free_cameras = ~np.isin(np.arange(problem.num_cameras), camera_index[~free_images])
     free = {"image_index": free_images, "point_index": free_points, "camera_index": free_cameras}
     cameras = np.unique(camera_index[images])
-    of_priors = [rows_about(prior, free, shared=False) for prior in problem.priors]  # the lever arm is held
+    of_priors = [rows_about(prior, free, shared=False) for prior in problem.priors]  # the antenna is held
     part = sub_problem(problem, rows, images, points, cameras, of_priors)
     part = part.fix(poses=~free_images[images], points=~free_points[points])
     part = _held(part, np.broadcast_to(~free_cameras[cameras][:, None], part.lower.shape))
@@ -97,7 +97,8 @@ def adjust_shared(
 
 def _held(problem: Problem, intrinsics: Selection) -> Problem:
     """Return the problem with these intrinsics and the lever arm held."""
-    return eqx.tree_at(lambda p: p.free.lever_arm, problem.fix(intrinsics=intrinsics), np.array(False))
+    held = problem.fix(intrinsics=intrinsics)
+    return eqx.tree_at(lambda p: (p.free.lever_arm, p.free.position_offset), held, (np.array(False),) * 2)
 
 
 def intersect(problem: Problem, points: Int[np.ndarray, " points"]) -> tuple[Problem, Bool[np.ndarray, " points"]]:

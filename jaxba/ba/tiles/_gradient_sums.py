@@ -51,7 +51,7 @@ class GradientSums:
         total.poses.quaternion[tile.images] += found.poses.quaternion
         total.poses.translation[tile.images] += found.poses.translation
         total.intrinsics[tile.cameras] += found.intrinsics
-        total.lever_arm[:] += found.lever_arm
+        total.antenna[:] += found.antenna
         total.points[tile.points] += found.points
 
     def assembled(
@@ -71,8 +71,8 @@ class GradientSums:
         intrinsics = through.intrinsics
         of_start = np.where(np.asarray(free.intrinsics), 0.0, intrinsics)
         changed = eqx.tree_at(
-            lambda p: (p.poses, p.cameras, p.points, p.priors, p.lever_arm, p.lower, p.upper, p.observations.xy_px,
-                       p.observations.std_px),
+            lambda p: (p.poses, p.cameras, p.points, p.priors, p.lever_arm, p.position_offset, p.lower, p.upper,
+                       p.observations.xy_px, p.observations.std_px),
             problem,
             (
                 Pose(through.poses.quaternion * fixed_pose, through.poses.translation * fixed_pose),
@@ -80,6 +80,7 @@ class GradientSums:
                 through.points * fixed_point,
                 tuple(map(_like_prior, problem.priors, self._priors, self._losses[1:])),
                 through.lever_arm * (not np.asarray(free.lever_arm)),
+                through.position_offset * (not np.asarray(free.position_offset)),
                 np.where(at_lower, intrinsics, 0.0),
                 np.where(at_upper, intrinsics, 0.0),
                 self._xy_px,

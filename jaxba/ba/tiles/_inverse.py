@@ -133,7 +133,7 @@ def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0, rows_of:
 
 def _empty(problem: Problem) -> tuple[Leverage, ...]:
     """Return arrays for the leverages of all rows."""
-    own = Unknowns(problem.poses, np.zeros(problem.free.intrinsics.shape), problem.lever_arm, problem.points)
+    own = Unknowns(problem.poses, np.zeros(problem.free.intrinsics.shape), problem.antenna, problem.points)
     components = [2, *(jax.eval_shape(prior.residual, own).shape[0] for prior in problem.priors)]
     counts = [problem.num_observations, *map(num_rows, problem.priors)]
     shapes = zip(counts, components, strict=True)

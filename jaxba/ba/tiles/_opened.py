@@ -35,6 +35,7 @@ def opened(
     folder: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     inverse: bool = False,
+    columns: int = 1,
     executors: Sequence[Executor] | None = None,
     executor_memory: float | str = EXECUTOR_MEMORY,
 ) -> Iterator[Engine]:
@@ -42,7 +43,7 @@ def opened(
 
     - `label`: of the function that asks, for messages. `max_memory` to `workers`, `executors`: see
       `solve_tiled`.
-    - `inverse`: whether its inverse is asked for, which takes more memory than steps do.
+    - `inverse`: whether its inverse is asked for, which takes more memory than steps do. `columns`: right-hand sides.
 
     Raises `JaxbaError` for options out of range, and where memory does not suffice.
     """
@@ -61,7 +62,7 @@ def opened(
         tree = dissect(
             problem, block=shape.block, border=shape.border, max_observations=max_observations, num_tiles=int(num_tiles)
         )
-        fronts = Fronts(tree, shape.block, shape.border)
+        fronts = Fronts(tree, shape.block, shape.border, columns)
         of_tiles = np.bincount(tree.tile_of_point[np.asarray(problem.observations.point_index)])
         work = fronts.bytes_in_inverse() if inverse else fronts.bytes_in_work(int(workers))
         budget = plan_memory(label, problem, fronts, limit, float(of_tiles.max()), int(workers), work)

@@ -19,6 +19,7 @@ from jaxba.ba._linearise import Linearisation, cost, curvature
 from jaxba.ba._refine import move_points, refine_points
 from jaxba.ba._schur import (
     ReducedVector,
+    apply_root,
     back_substitute,
     eliminate,
     eliminate_points,
@@ -59,9 +60,9 @@ class Sums(NamedTuple):
     points_held: Int[Array | np.ndarray, ""]
 
 
-def tail_size(block: int, border: int) -> int:
-    """Return border and right-hand side in blocks, rounded up."""
-    return -(-(border + 1) // block)
+def tail_size(block: int, border: int, columns: int = 1) -> int:
+    """Return border and right-hand sides in blocks, rounded up."""
+    return -(-(border + columns) // block)
 
 
 def hand_over(system: System, model: Linearisation, damping: Float[Array, ""]) -> Handed:
@@ -76,19 +77,39 @@ def handed(system: System, model: Linearisation, of_points: Float[Array | np.nda
 
     - `of_points`: what is added to the diagonal of the points. `rhs`: the tile's part of the right-hand side.
     """
+    return _handed(system, model, of_points, jax.tree.map(lambda leaf: leaf[None], rhs))
+
+
+def hand_columns(system: System, model: Linearisation, columns: Step) -> Handed:
+    """Return what a tile hands to fronts that have many right-hand sides: its part of each.
+
+    - `columns`: along a first axis of each leaf. So the root is handed `-g^T N^-1 g`, g all columns side by side.
+    """
+    damped, of_points = damped_points(model, jnp.zeros(()))
+    return _handed(system, damped, of_points + (1 - system.free.points), columns)
+
+
+def _handed(
+    system: System, model: Linearisation, of_points: Float[Array | np.ndarray, "points 3"], columns: Step
+) -> Handed:
     shape = system.shape
     zero = jax.tree.map(jnp.zeros_like, model.gradient)
     reduced = eliminate_points(system, model, eqx.tree_at(lambda s: s.points, zero, of_points))
-    vector = reduce_vector(system, reduced.points, rhs)
-    pad = tail_size(shape.block, shape.border) * shape.block - shape.border - 1
-    tail = jnp.concatenate([reduced.border, vector.images[:, :, None]], axis=2)
-    corner = jnp.concatenate([reduced.corner, vector.border[None]])
-    without_points = Step(model.gradient.poses, model.gradient.intrinsics, model.gradient.lever_arm, zero.points[:0])
+    vectors = jax.vmap(lambda rhs: reduce_vector(system, reduced.points, rhs))(columns)
+    count = len(vectors.border)
+    pad = tail_size(shape.block, shape.border, count) * shape.block - shape.border - count
+    tail = jnp.concatenate([reduced.border, jnp.moveaxis(vectors.images, 0, 2)], axis=2)
+    roots = jax.vmap(lambda points: apply_root(reduced.points.root, points[:, :, None]))(jnp.asarray(columns.points))
+    roots = roots.reshape(count, -1)
+    below = jnp.concatenate([vectors.border, -(roots @ roots.T)], axis=1)
+    above = jnp.pad(reduced.corner, ((0, 0), (0, count)))
+    corner = jnp.concatenate([above, below])
+    without_points = Step(model.gradient.poses, model.gradient.intrinsics, model.gradient.antenna, zero.points[:0])
     return Handed(
         reduced.diagonal,
         reduced.off_diagonal,
         jnp.swapaxes(jnp.pad(tail, ((0, 0), (0, 0), (0, pad))), 1, 2),
-        jnp.pad(corner, ((0, pad), (0, pad + 1))),
+        jnp.pad(corner, ((0, pad), (0, pad))),
         without_points,
         eqx.tree_at(lambda s: s.points, model.diagonal, zero.points[:0]),
         jnp.max(jnp.abs(model.gradient.points), initial=0.0),

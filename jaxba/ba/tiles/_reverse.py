@@ -53,11 +53,7 @@ class Reverse:
         self.at_lower, self.at_upper = self._at_bounds()
         free = engine.free
         held = free.intrinsics * ~(self.at_lower | self.at_upper)
-        engine.free = Step(free.poses, held, free.lever_arm, free.points)
-        first = np.full(problem.num_images, len(engine.tiles))
-        for number in reversed(range(len(engine.tiles))):
-            first[engine.tiles[number][0].images] = number
-        self.first_tile = first  # which gives an image's own part of a right-hand side
+        engine.free = Step(free.poses, held, free.antenna, free.points)
 
     def gradient(self, along_unknowns: Unknowns, along_cost: Float[np.ndarray, ""]) -> tuple[Problem, AbstractLoss]:
         engine = self.engine
@@ -173,7 +169,7 @@ class Reverse:
         for (tile, _), part in zip(engine.tiles, engine.each_tile(work), strict=True):
             tile.put(part, moved)
             moved.intrinsics[tile.solver_cameras] = part.intrinsics[: len(tile.cameras)]
-            moved.lever_arm[:] = part.lever_arm
+            moved.antenna[:] = part.antenna
         self.unknowns = moved
 
     def _to_tangent(self, cotangents: Unknowns) -> Step:
@@ -183,7 +179,7 @@ class Reverse:
         zero = Step(
             np.zeros((self.problem.num_images, 6)),
             np.zeros_like(unknowns.intrinsics),
-            np.zeros(3),
+            np.zeros_like(unknowns.antenna),
             np.zeros_like(unknowns.points),
         )
         _, pull = jax.vjp(unknowns.retract, zero)
@@ -192,27 +188,14 @@ class Reverse:
         return Step(
             poses * np.asarray(free.poses)[:, None],
             np.asarray(step.intrinsics) * engine.free.intrinsics,
-            np.asarray(step.lever_arm) * engine.free.lever_arm,
+            np.asarray(step.antenna) * engine.free.antenna,
             points * np.asarray(free.points)[:, None],
         )
 
     def _rhs_of_tile(self, along: Step, number: int, held: _Held) -> Step:
-        """Return a tile's part of a right-hand side: its points, the images first seen in it; the shared from one."""
-        tile, _ = self.engine.tiles[number]
-        plan = tile.plan
-        mine = self.first_tile == number
-        poses, intrinsics = np.zeros(held.free.poses.shape), np.zeros(held.free.intrinsics.shape)
-        points = np.zeros(held.free.points.shape)
-        poses[: len(tile.order)] = along.poses[tile.order] * mine[tile.order, None]
-        if self.engine.shape.own_cameras:
-            image_of_camera = np.argsort(self.engine.camera_index)
-            cameras = tile.solver_cameras
-            intrinsics[: len(cameras)] = along.intrinsics[cameras] * mine[image_of_camera[cameras], None]
-        elif number == 0:
-            intrinsics[:] = along.intrinsics
-        points[: len(tile.points)] = along.points[tile.points[plan.point_order]]
-        lever_arm = along.lever_arm if number == 0 else np.zeros(3)
-        return Step(poses, intrinsics, lever_arm, points * held.free.points)
+        """Return a tile's part of a right-hand side."""
+        part = self.engine.part_of(along, number)
+        return eqx.tree_at(lambda s: s.points, part, part.points * held.free.points)
 
     def _pull_tile(
         self,

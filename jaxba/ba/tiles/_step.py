@@ -58,7 +58,7 @@ class Stepper:
             return unknowns, call_compiled(self._judge, self._numbers, state, jax.tree.map(np.asarray, _NOTHING_TRIED))
         trial, sums, squared_norm = self._down(unknowns, self._border(unknowns, up.update), damping, bend)
         gradient = up.gradient
-        of_all = Step(gradient.poses, gradient.intrinsics, gradient.lever_arm, np.array([[up.steepest, 0.0, 0.0]]))
+        of_all = Step(gradient.poses, gradient.intrinsics, gradient.antenna, np.array([[up.steepest, 0.0, 0.0]]))
         tried = _NOTHING_TRIED | {
             "cost": sums.cost,
             "promised": -sums.slope - sums.curvature / 2,
@@ -91,11 +91,10 @@ class Stepper:
         corner = corner + np.tril(corner, -1).T
         lower = upper = None
         if engine.shape.any_bound:
+            far, free = np.full_like(engine.free.antenna, np.inf), engine.free
             lower, upper = (
-                engine.reduced(
-                    Step(engine.free.poses, bound - unknowns.intrinsics, far, engine.free.points), engine.camera_index
-                )[1]
-                for bound, far in ((engine.lower, np.full(3, -np.inf)), (engine.upper, np.full(3, np.inf)))
+                engine.reduced(Step(free.poses, of - unknowns.intrinsics, end, free.points), engine.camera_index)[1]
+                for of, end in ((engine.lower, -far), (engine.upper, far))
             )
         return np.asarray(call_compiled(box_minimum, corner, top[count, :count], lower, upper))
 
@@ -112,7 +111,7 @@ class Stepper:
         trial = Unknowns(
             Pose(unknowns.poses.quaternion.copy(), unknowns.poses.translation.copy()),
             unknowns.intrinsics + shared.intrinsics,
-            unknowns.lever_arm + shared.lever_arm,
+            unknowns.antenna + shared.antenna,
             unknowns.points.copy(),
         )
         totals = Sums(*[np.zeros(()) for _ in Sums._fields])
@@ -124,24 +123,24 @@ class Stepper:
         if self.engine.shape.own_cameras:
             refined = np.flatnonzero(self.engine.shape.refined)
             trial.intrinsics[self.engine.camera_index[:, None], refined] += solution[:, 6:]
-        squared = np.sum(solution**2) + np.sum(shared.intrinsics**2) + np.sum(shared.lever_arm**2) + totals.of_points
+        squared = np.sum(solution**2) + np.sum(shared.intrinsics**2) + np.sum(shared.antenna**2) + totals.of_points
         return trial, totals, float(squared)
 
     def _shared_step(self, unknowns: Unknowns, border: Float[np.ndarray, " border"]) -> Step:
-        """Return the border's step of intrinsics and lever arm, within the bounds."""
+        """Return the border's step of intrinsics and antenna, within the bounds."""
         shape, free = self.engine.shape, self.engine.free
-        intrinsics, lever_arm = np.zeros_like(free.intrinsics), np.zeros(3)
+        intrinsics, antenna = np.zeros_like(free.intrinsics), np.zeros_like(free.antenna)
         shared = shape.num_shared_cameras * shape.num_refined
         if shared:
             intrinsics[:, np.flatnonzero(shape.refined)] = border[:shared].reshape(-1, shape.num_refined)
-        if shape.lever_arm:
-            lever_arm = border[shared:]
+        if shape.antenna:
+            antenna = border[shared:]
         if shape.any_bound:
             moved = (
                 np.clip(unknowns.intrinsics + intrinsics, self.engine.lower, self.engine.upper) - unknowns.intrinsics
             )
             intrinsics = np.where(free.intrinsics > 0, moved, 0.0)
-        return Step(free.poses[:0], intrinsics, lever_arm, free.points)
+        return Step(free.poses[:0], intrinsics, antenna, free.points)
 
 
 def _calls_of_step(system: System, part: Unknowns, model: Linearisation) -> list[Call]:

@@ -46,7 +46,7 @@ class TileWork(abc.ABC):
     """What work on tiles needs.
 
     - `shape`, `tree`, `fronts`: of the block. `camera_index`: of its images. `free`: 1 for each free unknown of images,
-      cameras and lever arm.
+      cameras and antenna.
     - `shelf`: holds systems, and factors of the last way up. `models`: its equations, as far as they fit.
     """
 
@@ -114,7 +114,7 @@ class TileWork(abc.ABC):
     ) -> tuple[Unknowns, Sums, Float[np.ndarray, "own block"]]:
         """Return a tile's unknowns after a step, its part of what the step is judged by, and its images' solution.
 
-        - `solution`, `tail`: see `put_back_tile`. `shared`: the step of shared intrinsics and lever arm, within bounds.
+        - `solution`, `tail`: see `put_back_tile`. `shared`: the step of shared intrinsics and antenna, within bounds.
         """
         images = self.put_back_tile(number, solution, tail)
         system = self.system(number)
@@ -123,7 +123,7 @@ class TileWork(abc.ABC):
         if self.shape.own_cameras:
             intrinsics = np.zeros(part.intrinsics.shape)
             intrinsics[:, np.flatnonzero(self.shape.refined)] = images[:, 6:]
-        step = Step(images[:, :6], intrinsics, shared.lever_arm, np.zeros_like(part.points))
+        step = Step(images[:, :6], intrinsics, shared.antenna, np.zeros_like(part.points))
         solved = images, tail[: self.shape.border]
         after, sums = call_compiled(put_back, system, part, model, *solved, step, damping, bend)
         return (*jax.tree.map(np.asarray, (after, sums)), images[: len(self.tile(number)[0].order)])
@@ -136,7 +136,7 @@ class TileWork(abc.ABC):
         tile, fronts = self.tile(number)
         count = len(tile.order)
         squares, gradient = (
-            Step(part.poses[:count], part.intrinsics[: len(tile.cameras)], part.lever_arm, part.points)
+            Step(part.poses[:count], part.intrinsics[: len(tile.cameras)], part.antenna, part.points)
             for part in (handed.squares, handed.gradient)
         )
         images, _ = self.reduced(self.damping(squares, damping, tile), np.arange(count))
@@ -179,16 +179,16 @@ class TileWork(abc.ABC):
         """Return the images' and the border's part of a step, as `_schur.to_reduced` does."""
         shape = self.shape
         refined = step.intrinsics[:, np.flatnonzero(shape.refined)]
-        lever_arm = np.asarray(step.lever_arm if shape.lever_arm else step.lever_arm[:0])
+        antenna = np.asarray(step.antenna if shape.antenna else step.antenna[:0])
         if shape.own_cameras:
-            return np.concatenate([step.poses, refined[camera_index]], axis=1), lever_arm
-        return np.asarray(step.poses), np.concatenate([refined.reshape(-1), lever_arm])
+            return np.concatenate([step.poses, refined[camera_index]], axis=1), antenna
+        return np.asarray(step.poses), np.concatenate([refined.reshape(-1), antenna])
 
     def damping(self, squares: Step, damping: Float[np.ndarray, ""], tile: Tile | None = None) -> Step:
         """Return what is added to the diagonal of images and border, of a tile's or of all."""
         free = self.free
         if tile is not None:
-            free = Step(free.poses[tile.order], free.intrinsics[tile.solver_cameras], free.lever_arm, free.points)
+            free = Step(free.poses[tile.order], free.intrinsics[tile.solver_cameras], free.antenna, free.points)
 
         def added(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
             largest = squares.max(initial=0.0)

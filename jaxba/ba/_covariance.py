@@ -60,6 +60,13 @@ class Covariance:
     redundancy: int
     dropped: Dropped
 
+    @property
+    def correlation(self) -> Float[np.ndarray, "border border"]:
+        """Correlations of the shared unknowns named in `border_names`; NaN of those that are fixed."""
+        std = np.sqrt(np.diagonal(self.border))
+        known = np.where(std > 0, std, np.nan)
+        return self.border / np.outer(known, known)
+
 
 def covariance(
     problem: Problem,

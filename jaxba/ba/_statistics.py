@@ -13,15 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import chdtrc
 
 from jaxba._errors import JaxbaError
 from jaxba.ba._covariance import Covariance, marginals_at
 from jaxba.ba._leverage import Leverage
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._reliability import RowStatistics, row_statistics
-from jaxba.ba._variance_components import VarianceComponent, variance_components
+from jaxba.ba._tables import DataFrame, components_table, observations_table, prior_table
+from jaxba.ba._variance_components import VarianceComponent, reweighted, variance_components
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS
-from jaxba.geometry import AbstractLoss, Linear
+from jaxba.geometry import AbstractLoss, Linear, require_number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +40,43 @@ class Statistics:
     observations: RowStatistics
     priors: tuple[RowStatistics, ...]
     components: tuple[VarianceComponent, ...]
+
+    @property
+    def p_value(self) -> float:
+        """Of the global test: how often chance alone makes residuals as large as these, if all sigmas are true.
+
+        NaN where a loss is robust, under which the sum of squares follows no distribution that is known, or without
+        redundancy.
+        """
+        covariance, rows = self.covariance, (self.observations, *self.priors)
+        if covariance.redundancy <= 0 or not all(np.all(of.weight == 1) for of in rows):
+            return np.nan
+        return float(chdtrc(covariance.redundancy, covariance.variance_factor * covariance.redundancy))
+
+    def reweighted(self, most: float = 10.0) -> Problem:
+        """Return the problem with the sigmas that the variance components show, where enough is known of them.
+
+        One step of an iteration: solve it, and take its statistics again. Three steps are mostly enough.
+
+        - `most`: times that a sigma may grow, or shrink, at once.
+        """
+        require_number("reweighted: most", most, 1.0, np.finfo(float).max, "give 1 or more, such as 10")
+        return reweighted(self.problem, self.components, most)
+
+    def observations_frame(self) -> DataFrame:
+        """Return the table of observations, a row for each of the problem's; its columns: `ba/_tables.py`."""
+        return observations_table(self.problem, self.observations)
+
+    def prior_frame(self, name: str) -> DataFrame:
+        """Return the table of a prior; raises `JaxbaError` where the problem has none of the name."""
+        prior = self.problem.prior(name)
+        rows = self.prior(name)
+        assert prior is not None  # or there were no rows of it
+        return prior_table(self.problem, prior, rows)
+
+    def components_frame(self) -> DataFrame:
+        """Return the table of variance components."""
+        return components_table(self.components)
 
     def prior(self, name: str) -> RowStatistics:
         """Return the statistics of a prior's rows; raises `JaxbaError` where the problem has none of the name."""

@@ -5,8 +5,8 @@ With v over sigmas and r the redundancy numbers of a kind's measurements, the fa
     k^2 = sum v^2 / sum r
 
 and as in `_variance_factor.py` where a loss is robust. It is one step of an iteration: with the sigmas multiplied by k
-and the adjustment made anew, the next factors are nearer to one. The factor's own sigma is k^2 sqrt(2 / sum r), of
-normal errors.
+(`reweighted`) and the adjustment made anew, the next factors are nearer to one. The factor's own sigma is
+k^2 sqrt(2 / sum r), of normal errors.
 """
 
 import dataclasses
@@ -80,6 +80,31 @@ def variance_components(
             kinds.append((prior.name.replace("_", " "), prior.loss, rows, every, [True] * rows.std.shape[1]))
     found = (_component(name, loss, rows, mine, np.array(axes)) for name, loss, rows, mine, axes in kinds)
     return tuple(component for component in found if component.count)
+
+
+def reweighted(problem: Problem, components: Sequence[VarianceComponent], most: float) -> Problem:
+    """Return the problem with the sigmas that the residuals show, for the kinds of which enough is known.
+
+    - `most`: times that a sigma may grow, or shrink, at once.
+    """
+    std_px = np.array(problem.observations.std_px, float)
+    priors = list(problem.priors)
+    names = [prior.name for prior in priors]
+    for component in components:
+        if not (component.is_known and component.factor > 0):
+            continue
+        times = float(np.clip(np.sqrt(component.factor), 1 / most, most))
+        if component.group == "observations":
+            std_px[component.rows] *= times
+            continue
+        number = names.index(component.group)
+        field = next(f.name for f in dataclasses.fields(priors[number]) if f.name.startswith("std"))
+        std = np.array(getattr(priors[number], field), float)
+        by_axis = std if std.ndim == 2 else std[:, None]
+        by_axis[np.ix_(component.rows, component.axes)] *= times
+        priors[number] = dataclasses.replace(priors[number], **{field: std})
+    observations = dataclasses.replace(problem.observations, std_px=std_px)
+    return dataclasses.replace(problem, observations=observations, priors=tuple(priors))
 
 
 def _component(

@@ -90,6 +90,14 @@ class SolveOptions:
     ] = None
     rounds: Annotated[int | None, Parameter(help="How often --reject does so at most. [default: 2]")] = None
     mad_factor: Annotated[float, Parameter(help="Factor of the MAD, for the inlier rate and --reject.")] = 2.5
+    statistics: Annotated[
+        bool,
+        Parameter(
+            negative="",
+            show_default=False,
+            help="After the solve: variance components, tests of all measurements, correlations of the intrinsics.",
+        ),
+    ] = False
     out: Annotated[
         Path | None,
         Parameter(

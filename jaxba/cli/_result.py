@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.ba import Problem, Rejected, Report
+from jaxba.ba import Problem, Rejected, Report, Statistics
 from jaxba.cli._options import SolveOptions
+from jaxba.cli._statistics import statistics_facts, statistics_rows
 from jaxba.cli._text import first_of, gauge_text, many, table
 from jaxba.geometry import AbstractLoss, Linear
 
@@ -23,7 +24,7 @@ class Run:
     """A finished `solve`.
 
     - `given`: the problem as read; `problem`: with the options' fixed blocks and bounds.
-    - `seconds`: all rounds together, with setup and compile.
+    - `seconds`: all rounds together, with setup and compile. `statistics`: where they were asked for.
     """
 
     file: Path
@@ -34,6 +35,7 @@ class Run:
     loss: AbstractLoss
     options: SolveOptions
     seconds: float
+    statistics: Statistics | None = None
 
     @property
     def report(self) -> Report:
@@ -103,6 +105,7 @@ def facts(run: Run) -> dict[str, object]:
             {"step": step.step, "seconds": step.seconds, "cost": step.cost, "accepted": step.accepted}
             for step in report.history
         ],
+        **({} if run.statistics is None else {"statistics": statistics_facts(run.statistics)}),
     }
 
 
@@ -139,6 +142,7 @@ def summary(run: Run) -> str:
             ),
             ("intrinsics", _refined(run)),
             ("at bounds", first_of(bounds, _MOST_BOUNDS) if bounds else []),
+            *(statistics_rows(run.statistics) if run.statistics is not None else ()),
             ("written", str(run.out)),
         )
     )

@@ -1,6 +1,7 @@
 """`jaxba solve`: read, adjust, write, tell."""
 
 import contextlib
+import dataclasses
 import functools
 import math
 import os
@@ -9,11 +10,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from jaxba._atomic import refuse_same_file, refuse_unwritable
 from jaxba._errors import JaxbaError
-from jaxba.ba import HistoryStep, Problem, Rejected, solve_and_reject, solve_tiled
+from jaxba.ba import HistoryStep, Problem, Rejected, Statistics, solve_and_reject, solve_tiled, statistics
 from jaxba.cli import _progress
 from jaxba.cli._options import INTERRUPTED, NOT_CONVERGED, SolveOptions
 from jaxba.cli._result import Run, facts, summary
@@ -55,7 +57,7 @@ def run(file: Path, options: SolveOptions) -> int:
     found = _adjust(problem, loss, options, standing)
     seconds = time.perf_counter() - begin
     _write(out, given, problem, found, extras)
-    done = Run(file, out, given, problem, found, loss, options, seconds)
+    done = Run(file, out, given, problem, found, loss, options, seconds, _statistics(problem, found, loss, options))
     if options.json:
         print(to_json(facts(done)))
     elif not options.quiet:
@@ -71,8 +73,6 @@ def use_device(name: str | None) -> None:
     """Let jax compute on a kind of device; raise `JaxbaError` where it sees none. None leaves the choice to jax."""
     if name is None:
         return
-    import jax
-
     try:
         device = jax.devices(name)[0]
     except RuntimeError as error:
@@ -233,6 +233,18 @@ def rounds_of(options: SolveOptions) -> int:
     """Return how many rounds of rejection were asked for at most."""
     asked = _ROUNDS if options.rounds is None else options.rounds
     return asked if options.reject else 0
+
+
+def _statistics(problem: Problem, found: Rejected, loss: AbstractLoss, options: SolveOptions) -> Statistics | None:
+    """Return the statistics of what the last round used, where they are asked for."""
+    if not options.statistics:
+        return None
+    used = np.asarray(found.used)
+    adjusted = found.solution.apply(problem)
+    if not used.all():
+        seen = jax.tree.map(lambda values: np.asarray(values)[used], adjusted.observations)
+        adjusted = dataclasses.replace(adjusted, observations=seen)
+    return statistics(adjusted, loss=loss, max_memory=options.max_memory)
 
 
 def _write(out: Path, given: Problem, problem: Problem, found: Rejected, extras: Mapping[str, np.ndarray]) -> None:

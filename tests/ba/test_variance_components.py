@@ -1,0 +1,92 @@
+"""Variance components: planted sigmas come back, kind by kind; the global test; tables of all of it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxba
+from jaxba import Huber, JaxbaError, Statistics
+from jaxba.ba import Problem
+from jaxba.geometry import AbstractLoss, Linear
+
+PIXEL_STD_PX, GNSS_STD_M, CONTROL_STD_M = 0.3, (0.02, 0.02, 0.05), (0.01, 0.01, 0.01)
+
+
+def wrongly_weighed(outlier_fraction: float) -> Problem:
+    """A block whose sigmas are stated as 1 px, 3 and 5 m, and 3 cm."""
+    survey = jaxba.synthetic.uav_block(
+        20, seed=3, points_per_image=30.0, num_control=14, pixel_std_px=PIXEL_STD_PX, gnss_std_m=GNSS_STD_M,
+        control_std_m=CONTROL_STD_M, outlier_fraction=outlier_fraction,
+    )  # fmt: skip
+    problem = survey.problem
+    stated = {"position": (3.0, 3.0, 5.0), "control": (0.03, 0.03, 0.03)}
+    priors = tuple(
+        dataclasses.replace(prior, std_m=np.tile(stated[prior.name], (len(prior.std_m), 1))) for prior in problem.priors
+    )
+    observations = dataclasses.replace(problem.observations, std_px=np.ones(problem.num_observations))
+    return dataclasses.replace(problem, observations=observations, priors=priors)
+
+
+def statistics_of(problem: Problem, loss: AbstractLoss) -> Statistics:
+    return jaxba.statistics(jaxba.solve(problem, loss=loss).apply(problem), loss=loss)
+
+
+@pytest.mark.parametrize(("loss", "outliers"), [(Linear(), 0.0), (Huber(1.0), 0.02)], ids=["linear", "huber"])
+def test_planted_sigmas_come_back(loss: AbstractLoss, outliers: float) -> None:
+    problem = wrongly_weighed(outliers)
+    found = statistics_of(problem, loss)
+    for _ in range(4):
+        problem = found.reweighted(1e3)
+        found = statistics_of(problem, loss)
+    std = {component.name: component.std for component in found.components}
+    planted = {
+        "tie points": PIXEL_STD_PX, "marks": PIXEL_STD_PX, "position horizontal": GNSS_STD_M[0],
+        "position vertical": GNSS_STD_M[2], "control horizontal": CONTROL_STD_M[0],
+    }  # fmt: skip
+    for component in found.components:
+        assert component.is_known, component
+        # settled, and right within three of its own sigmas, of some 1% to 25%; 2% of gross errors add 5%
+        assert component.factor == pytest.approx(1.0, abs=0.1), component.name
+        if component.name in planted:
+            allowed = max(3 / np.sqrt(2 * component.redundancy), 3 * outliers)
+            assert std[component.name] == pytest.approx(planted[component.name], rel=allowed), component
+
+
+def test_kinds_without_redundancy_keep_their_sigmas_and_say_so() -> None:
+    problem = jaxba.synthetic.uav_block(20, seed=3, points_per_image=30.0, num_control=2).problem
+    found = statistics_of(problem, Linear())
+    control = [component for component in found.components if component.group == "control"]
+    assert len(control) == 2 and not any(component.is_known for component in control)
+    priors = {prior.name: prior for prior in found.reweighted().priors}
+    np.testing.assert_array_equal(priors["control"].std_m, problem.prior("control").std_m)  # type: ignore[union-attr]
+    assert (priors["position"].std_m != problem.prior("position").std_m).all()  # type: ignore[union-attr]
+    with pytest.raises(JaxbaError, match="most"):
+        found.reweighted(0.5)
+
+
+def test_global_test_tells_true_sigmas_from_small_ones() -> None:
+    problem = jaxba.synthetic.uav_block(20, seed=3, points_per_image=30.0).problem
+    right = statistics_of(problem, Linear())
+    assert 0.005 < right.p_value < 0.995
+    small = dataclasses.replace(problem.observations, std_px=0.9 * problem.observations.std_px)
+    assert statistics_of(dataclasses.replace(problem, observations=small), Linear()).p_value < 1e-6
+    assert np.isnan(statistics_of(problem, Huber(1.0)).p_value)  # squares under a robust loss follow no known law
+
+
+def test_tables_hold_a_row_for_each_measurement() -> None:
+    problem = jaxba.synthetic.uav_block(20, seed=3, points_per_image=30.0, num_control=14).problem
+    found = statistics_of(problem, Linear())
+    seen = found.observations_frame()
+    assert len(seen) == problem.num_observations and seen["residual_x_px"].notna().all()
+    np.testing.assert_array_equal(seen["point"], problem.observations.point_index)
+    np.testing.assert_array_equal(seen["test_y"], found.observations.test[:, 1])
+    control = found.prior_frame("control")
+    assert control["point"].tolist() == list(range(14)) and {"detectable_z_m", "reach_x_m"} <= set(control.columns)
+    assert found.components_frame().set_index("name").loc["marks", "count"] > 28
+    total = seen[["redundancy_x", "redundancy_y"]].to_numpy().sum() + sum(
+        found.prior_frame(name).filter(like="redundancy").to_numpy().sum() for name in ("position", "control")
+    )
+    assert total == pytest.approx(found.covariance.redundancy, abs=1e-6)
+    with pytest.raises(JaxbaError, match="no prior 'attitude'; it has position, control"):
+        found.prior_frame("attitude")

@@ -35,7 +35,7 @@ hypothesis.settings.load_profile("tests")
 # thousand, whose types pyright knows
 jaxtyping.install_import_hook(
     [f"jaxba.{module.name}" for module in pkgutil.iter_modules(jaxba.__path__) if module.name != "engine"],
-    "beartype.beartype",
+    "type_checks.checked",
 )
 
 

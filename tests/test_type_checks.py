@@ -54,3 +54,18 @@ def test_annotations_are_alike_where_they_mean_the_same():
         assert _alike(make()) == _alike(make()) and hash(_alike(make())) == hash(_alike(make()))
     assert _alike(Callable[[int], str]) != _alike(Callable[[str], int])
     assert _alike(Literal[1]) != _alike(Literal[True])
+
+
+def test_a_result_is_held_to_the_sizes_of_the_arguments():
+    # breaks where the arguments are not looked at before the call, or what they said is lost after it
+    @jaxtyping.jaxtyped(typechecker=checked)
+    def firsts(rows: Float[np.ndarray, "rows 3"], count: int) -> Float[np.ndarray, " rows"]:
+        return rows[:count, 0]
+
+    assert firsts(np.zeros((4, 3)), 4).shape == (4,)
+    with pytest.raises(jaxtyping.TypeCheckError, match="the return value of"):
+        firsts(np.zeros((4, 3)), 2)
+    with pytest.raises(jaxtyping.TypeCheckError, match="the parameters of"):
+        firsts(np.zeros((4, 2)), 4)
+    with pytest.raises(jaxtyping.TypeCheckError, match="the parameters of"):
+        firsts(np.zeros((4, 3)), 4.0)

@@ -87,6 +87,14 @@ def made(tmp_path_factory: pytest.TempPathFactory, photos: Path) -> "Survey":
     return Survey(photos, once(shared_folder(tmp_path_factory), "run", make_project(photos)) / "project")
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the cloud's picture, which takes most of an export's time."""
+    from jaxba.pipeline import export
+
+    monkeypatch.setattr(export, "_picture", lambda *given: b"none")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _few_programs() -> Iterator[None]:
     """Unload programs in time, and let the collector pass over the millions of objects that jax keeps of a module."""

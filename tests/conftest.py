@@ -5,6 +5,7 @@ share one cache on the disk.
 """
 
 import gc
+import importlib
 import os
 import pkgutil
 import sys
@@ -17,6 +18,7 @@ import hypothesis
 import jax
 import jaxtyping
 import pytest
+from threadpoolctl import threadpool_limits
 
 import jaxba
 from jaxba.engine._compile_cache import use_compilation_cache
@@ -28,6 +30,11 @@ if TYPE_CHECKING:
 sys.path += [str(folder) for folder in (Path(__file__).parent, *sorted(Path(__file__).parent.glob("[a-z]*/")))]
 jax.config.update("jax_enable_x64", True)
 use_compilation_cache()
+# the session's processes keep the cores busy among them: further threads of BLAS only wait for each other, which took
+# half of the time of dense references. numpy and scipy have a BLAS each, which hears of it once it is loaded
+for library in ("numpy.linalg", "scipy.linalg"):
+    importlib.import_module(library)
+threadpool_limits(1, user_api="blas")
 # the same examples each time, however long one takes on a machine that is busy
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")
@@ -35,7 +42,7 @@ hypothesis.settings.load_profile("tests")
 # thousand, whose types pyright knows
 jaxtyping.install_import_hook(
     [f"jaxba.{module.name}" for module in pkgutil.iter_modules(jaxba.__path__) if module.name != "engine"],
-    "beartype.beartype",
+    "type_checks.checked",
 )
 
 
@@ -78,6 +85,14 @@ def made(tmp_path_factory: pytest.TempPathFactory, photos: Path) -> "Survey":
     from small_survey import Survey, make_project, once, shared_folder
 
     return Survey(photos, once(shared_folder(tmp_path_factory), "run", make_project(photos)) / "project")
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the cloud's picture, which takes most of an export's time."""
+    from jaxba.pipeline import export
+
+    monkeypatch.setattr(export, "_picture", lambda *given: b"none")
 
 
 @pytest.fixture(scope="module", autouse=True)

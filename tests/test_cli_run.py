@@ -48,7 +48,9 @@ def test_a_second_run_says_that_there_is_nothing_to_do(cli: Cli, made: Survey, t
     assert cli("run", survey.photos, "--out", survey.project, *FLAGS, "--quiet") == (0, "", "")
 
 
-def test_each_stage_that_ran_has_its_lines_none_twice_and_none_too_wide(cli: Cli, made: Survey, tmp_path: Path):
+def test_each_stage_that_ran_has_its_lines_none_twice_and_none_too_wide(
+    cli: Cli, made: Survey, tmp_path: Path, undrawn: None
+):
     survey = made.copy(tmp_path)
     code, out, _ = cli("run", survey.photos, "--out", survey.project, *FLAGS, "--crs", "EPSG:6344")
     lines = out.splitlines()

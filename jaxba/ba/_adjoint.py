@@ -138,8 +138,13 @@ def _at_the_optimum(system: System, unknowns: Unknowns, exact: bool) -> tuple[Un
 
 
 def _call(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function, compiled ahead where its arguments are known."""
-    return function(*arguments) if is_traced(arguments) else call_compiled(function, *arguments)
+    """Call a module's function, compiled ahead where its arguments are known, else traced once for all its calls."""
+    return _traced_once(function)(*arguments) if is_traced(arguments) else call_compiled(function, *arguments)
+
+
+@functools.cache
+def _traced_once(function: Callable[..., Any]) -> Callable[..., Any]:
+    return jax.jit(function)
 
 
 def settled(system: System, unknowns: Unknowns) -> Unknowns:

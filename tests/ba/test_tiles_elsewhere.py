@@ -1,9 +1,10 @@
 """Tiles in other processes: the same bytes as in this one, whoever works on them and whoever is lost."""
 
 import dataclasses
+import functools
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -20,6 +21,13 @@ from jaxba.ba.tiles import _elsewhere
 from jaxba.geometry import AbstractLoss, Huber, Linear
 
 _OPTIONS = {"num_tiles": 4, "max_nfev": 3}
+_HUBER = Huber(1.0)
+
+
+@functools.cache
+def _here(problem: Callable[[], Problem], loss: AbstractLoss) -> Solution:
+    """Return what this process finds on its own."""
+    return jaxba.solve_tiled(problem(), loss=loss, **_OPTIONS)
 
 
 class _Lost(ThreadPoolExecutor):
@@ -49,14 +57,14 @@ def _same(first: Solution, second: Solution) -> None:
 
 @pytest.mark.parametrize(
     ("problem", "loss", "after"),
-    [(everything, Huber(1.0), None), (everything, Huber(1.0), 7), (with_own_cameras, Linear(), 2)],
+    [(everything, _HUBER, None), (everything, _HUBER, 7), (with_own_cameras, Linear(), 2)],
     ids=["all there", "one lost", "one lost, own cameras"],
 )
 def test_executors_give_the_bytes_of_this_process(
     problem: Any, loss: AbstractLoss, after: int | None, tmp_path: Path
 ) -> None:
     # breaks where a tile depends on what this process holds, or a process that has not been up goes down
-    once = jaxba.solve_tiled(problem(), loss=loss, **_OPTIONS)
+    once = _here(problem, loss)
     with ThreadPoolExecutor(2) as whole, ThreadPoolExecutor(1) if after is None else _Lost(after) as other:
         executors: Sequence[Executor] = [other, whole]
         again = jaxba.solve_tiled(problem(), loss=loss, **_OPTIONS, executors=executors, folder=tmp_path)
@@ -66,7 +74,7 @@ def test_executors_give_the_bytes_of_this_process(
 
 def test_what_a_process_does_not_keep_lies_in_files_or_is_made_again(tmp_path: Path) -> None:
     # breaks where a system, a factor or equations are gone on the way down
-    once = jaxba.solve_tiled(everything(), loss=Huber(1.0), **_OPTIONS)
+    once = _here(everything, _HUBER)
     opened: list[list[str]] = []
 
     def look(*_: object) -> None:
@@ -85,7 +93,7 @@ _SHELF = _elsewhere.Shelf
 
 
 def test_a_process_that_is_killed_in_a_tile_costs_no_more_than_its_work(tmp_path: Path) -> None:
-    once = jaxba.solve_tiled(everything(), loss=Huber(1.0), **_OPTIONS)
+    once = _here(everything, _HUBER)
     spawn = get_context("spawn")
     with ProcessPoolExecutor(1, spawn) as first, ProcessPoolExecutor(1, spawn) as second:
         victims = [first.submit(os.getpid).result()]

@@ -214,8 +214,8 @@ def test_a_run_on_a_cluster_makes_the_same_bytes_though_workers_are_killed(
             kill()
 
     def in_tiles(survey: Survey, *changes: str, tell: Callable[[Event], None] = lambda event: None) -> Run:
-        """Run with tiles of three photos, which are fewer than may be asked for."""
-        settings = changed(PIPELINE.settings, [*FAST, "workers.workers=1", *changes])
+        """Run two rounds with tiles of three photos, which are fewer than may be asked for."""
+        settings = changed(PIPELINE.settings, [*FAST, "workers.workers=1", "adjust.max_rounds=2", *changes])
         monkeypatch.setitem(vars(settings["tiles"]), "chunk_size", 3)
         return run_pipeline(survey.photos, survey.project, settings, tell=tell)
 

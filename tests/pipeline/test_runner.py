@@ -17,7 +17,7 @@ from jaxba.engine import changed, from_toml
 from jaxba.engine._fingerprint import fingerprint
 from jaxba.engine._room import Room
 from jaxba.engine._store import load
-from jaxba.pipeline import NAMES, PIPELINE, Done, Event, adjust, export, run_pipeline, start
+from jaxba.pipeline import NAMES, PIPELINE, Done, Event, adjust, run_pipeline, start
 from jaxba.scene import Finding
 
 FIRST, LAST = "SIM_0001.JPG", f"SIM_{NUM_PHOTOS:04d}.JPG"
@@ -30,11 +30,8 @@ def done(made: Survey, tmp_path_factory: pytest.TempPathFactory) -> Done:
 
 
 @pytest.fixture
-def quick(done: Done, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put the outputs of the whole run in place of the two stages that compile, with a mark of what went in.
-
-    The cloud's picture, which takes most of an export's time, is left out.
-    """
+def quick(done: Done, undrawn: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put the outputs of the whole run in place of the two stages that compile, with a mark of what went in."""
     block = done.start.block
 
     def start_run(inputs: start.Inputs, params: start.Params) -> start.Outputs:
@@ -46,7 +43,6 @@ def quick(done: Done, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(start, "run", start_run)
     monkeypatch.setattr(adjust, "run", adjust_run)
-    monkeypatch.setattr(export, "_picture", lambda *given: b"none")
 
 
 def inodes(folder: Path) -> dict[str, int]:
@@ -133,7 +129,7 @@ def test_tiles_concern_the_adjustment_of_blocks_with_more_photos_alone(
     assert PIPELINE["adjust"].inputs(done).chunk_size == NUM_PHOTOS - 1
 
 
-def test_another_target_crs_reruns_crs_and_export_alone(made: Survey, tmp_path: Path):
+def test_another_target_crs_reruns_crs_and_export_alone(made: Survey, tmp_path: Path, undrawn: None):
     survey = made.copy(tmp_path)
     before = exported(survey.project)
     run = survey.run("crs.target_crs=EPSG:6344")  # NAD83(2011) / UTM zone 15N
@@ -283,7 +279,7 @@ def test_a_script_that_its_workers_cannot_import_is_told_how_to_be(photos: Path,
     assert ended.returncode == 1 and "In a script, call the pipeline under 'if __name__ ==" in ended.stderr
 
 
-def test_an_export_folder_that_was_removed_is_written_again(made: Survey, tmp_path: Path):
+def test_an_export_folder_that_was_removed_is_written_again(made: Survey, tmp_path: Path, undrawn: None):
     survey = made.copy(tmp_path)
     shutil.rmtree(survey.project / "export")
     assert survey.run().stages_run == ("export",)

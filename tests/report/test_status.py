@@ -57,7 +57,7 @@ def test_a_changed_photo_makes_its_features_stale_alone(made: Survey, tmp_path: 
     assert (features.state, features.num_done, features.reason) == ("stale", NUM_PHOTOS - 1, "changed: photo")
 
 
-def test_damage_is_named_and_made_anew(made: Survey, tmp_path: Path):
+def test_damage_is_named_and_made_anew(made: Survey, tmp_path: Path, undrawn: None):
     survey = made.copy(tmp_path)
     array = survey.project / "stages" / "features" / FIRST / "features.xy_px.npy"
     array.write_bytes(array.read_bytes()[:-8] + bytes(8))

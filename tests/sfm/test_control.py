@@ -14,6 +14,7 @@ from jaxba.scene import Control, Finding
 from jaxba.sfm import (
     Adjusted,
     Settings,
+    Uncertainty,
     adjust,
     apply_control,
     control_findings,
@@ -90,6 +91,11 @@ def found_on(survey: Simulated, control: Control, made: tuple[Adjusted, Controll
 @pytest.fixture(scope="module")
 def made(survey: Simulated, points: Control) -> tuple[Adjusted, Controlled]:
     return run(survey, points)
+
+
+@pytest.fixture(scope="module")
+def sigmas(survey: Simulated, made: tuple[Adjusted, Controlled]) -> Uncertainty:
+    return uncertainty_of(made[0], survey.reference)
 
 
 def test_check_points_lie_where_they_were_surveyed_though_gnss_is_metres_off(
@@ -217,11 +223,11 @@ def test_points_have_no_sigma_along_an_axis_that_nothing_measured_holds(
     survey: Simulated,
     points: Control,
     made: tuple[Adjusted, Controlled],
+    sigmas: Uncertainty,
     method: str,
     unknown: list[int],
     has_heights: bool,
 ) -> None:
-    sigmas = uncertainty_of(made[0], survey.reference)
     point_std_m = sigmas.point_std_m.copy()
     point_std_m[:, unknown] = np.nan
     control = replace(points if has_heights else without_heights(points), method=method)

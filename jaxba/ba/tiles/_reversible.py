@@ -15,7 +15,7 @@ from jaxba.ba._problem import Problem
 from jaxba.ba._solution import Solution
 from jaxba.ba._system import is_traced, own_unknowns
 from jaxba.ba._traced import NOT_DOUBLE
-from jaxba.ba.checks import require_gauge
+from jaxba.ba.checks import prepare, require_gauge
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Engine
 from jaxba.ba.tiles._reverse import Reverse
@@ -46,9 +46,10 @@ def solve_reversibly(
             raise JaxbaError(NOT_DOUBLE)
         problem, loss = jax.tree.map(np.asarray, eqx.combine(numbers, rest))
         require_gauge(problem, "Derivatives")
+        dropped = prepare(problem).dropped
+        if dropped.any():  # said before the solve, which may take hours
+            raise JaxbaError(f"{_LEFT_OUT} {dropped.summary()}")
         solution = solve(problem, loss)
-        if solution.report is not None and solution.report.dropped.any():
-            raise JaxbaError(f"{_LEFT_OUT} {solution.report.dropped.summary()}")
         if not solution.converged:
             raise JaxbaError(NOT_A_MINIMUM)
         unknowns = own_unknowns(solution.apply(problem))

@@ -24,7 +24,8 @@ class Run:
     """A finished `solve`.
 
     - `given`: the problem as read; `problem`: with the options' fixed blocks and bounds.
-    - `seconds`: all rounds together, with setup and compile. `statistics`: where they were asked for.
+    - `seconds`: all rounds together, with setup and compile. `statistics`: where they were asked for,
+      or why there are none.
     """
 
     file: Path
@@ -35,7 +36,7 @@ class Run:
     loss: AbstractLoss
     options: SolveOptions
     seconds: float
-    statistics: Statistics | None = None
+    statistics: Statistics | str | None = None
 
     @property
     def report(self) -> Report:

@@ -235,8 +235,10 @@ def rounds_of(options: SolveOptions) -> int:
     return asked if options.reject else 0
 
 
-def _statistics(problem: Problem, found: Rejected, loss: AbstractLoss, options: SolveOptions) -> Statistics | None:
-    """Return the statistics of what the last round used, where they are asked for."""
+def _statistics(
+    problem: Problem, found: Rejected, loss: AbstractLoss, options: SolveOptions
+) -> Statistics | str | None:
+    """Return the statistics of what the last round used, or why there are none; None where they are not asked for."""
     if not options.statistics:
         return None
     used = np.asarray(found.used)
@@ -244,7 +246,10 @@ def _statistics(problem: Problem, found: Rejected, loss: AbstractLoss, options: 
     if not used.all():
         seen = jax.tree.map(lambda values: np.asarray(values)[used], adjusted.observations)
         adjusted = dataclasses.replace(adjusted, observations=seen)
-    return statistics(adjusted, loss=loss, max_memory=options.max_memory)
+    try:
+        return statistics(adjusted, loss=loss, max_memory=options.max_memory)
+    except JaxbaError as error:  # the solution is there and written
+        return str(error)
 
 
 def _write(out: Path, given: Problem, problem: Problem, found: Rejected, extras: Mapping[str, np.ndarray]) -> None:

@@ -12,8 +12,10 @@ _CORRELATED = 0.8
 _LIMIT = 3.29  # sigmas: one of a thousand by chance
 
 
-def statistics_facts(found: Statistics) -> dict[str, Any]:
-    """Return the statistics by name, for `--json`."""
+def statistics_facts(found: Statistics | str) -> dict[str, Any]:
+    """Return the statistics by name, or why there are none, for `--json`."""
+    if isinstance(found, str):
+        return {"why_not": found}
     covariance = found.covariance
     groups = (found.observations, *found.priors)
     return {
@@ -32,8 +34,10 @@ def statistics_facts(found: Statistics) -> dict[str, Any]:
     }
 
 
-def statistics_rows(found: Statistics) -> list[tuple[str, list[str]]]:
+def statistics_rows(found: Statistics | str) -> list[tuple[str, list[str]]]:
     """Return the rows of the summary in words."""
+    if isinstance(found, str):
+        return [("sigmas", [f"There are none. {found}"])]
     covariance = found.covariance
     groups = (found.observations, *found.priors)
     judged = f"variance factor {covariance.variance_factor:.3f}, redundancy {covariance.redundancy}"

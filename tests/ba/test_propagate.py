@@ -18,7 +18,7 @@ def several(problem: Problem) -> jax.Array:
     focal = [jnp.asarray(getattr(problem.cameras, name))[-1] for name in ("fx", "k1")]
     return jnp.concatenate(
         [
-            jnp.linalg.norm(points[jnp.array([40, 80])] - points[jnp.array([120, 200])], axis=1),
+            jnp.linalg.norm(points[jnp.array([40, 80])] - points[jnp.array([120, 150])], axis=1),
             poses.center[5],
             poses.rotation[6, 0],
             poses.transform(points[jnp.arange(12)])[2],

@@ -15,7 +15,7 @@ from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt, residuals
-from jaxba.ba._statistics import Statistics, statistics
+from jaxba.ba._statistics import Statistics, prior_statistics, statistics
 from jaxba.ba._tune import Tuned, tune
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.ba._variance_components import VarianceComponent
@@ -84,6 +84,7 @@ __all__ = [
     "merge_tiles",
     "partition",
     "prepare",
+    "prior_statistics",
     "project_in_cameras",
     "propagate",
     "quality",

@@ -23,7 +23,7 @@ from jaxba.ba._variance_factor import variance_factor
 from jaxba.ba.checks import Dropped, prepare, require_gauge
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Engine
-from jaxba.ba.tiles._inverse import Marginals, compile_marginals, marginals
+from jaxba.ba.tiles._inverse import Marginals, Rows, compile_marginals, marginals
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
@@ -97,13 +97,13 @@ def covariance(
         "folder": folder,
         "workers": workers,
     }
-    return marginals_at("Covariance", problem, Linear() if loss is None else loss, with_rows=False, **room)[0]
+    return marginals_at("Covariance", problem, Linear() if loss is None else loss, "none", **room)[0]
 
 
 def marginals_at(
-    label: str, problem: Problem, loss: AbstractLoss, *, with_rows: bool, **room: Any
+    label: str, problem: Problem, loss: AbstractLoss, rows: Rows, **room: Any
 ) -> tuple[Covariance, tuple[Leverage, ...], Int[np.ndarray, " kept"]]:
-    """Return the covariances, the leverages of all rows where they are wanted, and the observations that took part.
+    """Return the covariances, the leverages of the rows that are asked for, and the observations that took part.
 
     - `label`: of the function that asks, for messages. `room`: as in `covariance`, whose errors it raises.
     """
@@ -111,12 +111,12 @@ def marginals_at(
     prepared = prepare(problem)
     problem = prepared.problem
     require_gauge(problem, label)
-    unknowns, rows_of = own_unknowns(problem), problem if with_rows else None
+    unknowns = own_unknowns(problem)
     with opened(label.lower(), problem, loss, inverse=True, **room) as engine:
-        compile_marginals(engine, unknowns, rows_of)
-        found = _marginals(engine, unknowns, 0.0, rows_of)
+        compile_marginals(engine, unknowns, rows)
+        found = _marginals(engine, problem, unknowns, 0.0, rows)
         if found is None or not _determined(found):
-            weakest = _weakest(_marginals(engine, unknowns, _PROBING), problem)
+            weakest = _weakest(_marginals(engine, problem, unknowns, _PROBING), problem)
             raise JaxbaError(
                 f"{label}: the measurements do not determine {weakest}. Hold it fixed or add a prior; an image "
                 "needs three points or more that others see, and intrinsics need views from different heights or sides."
@@ -125,10 +125,12 @@ def marginals_at(
     return _in_order(found, losses, problem, prepared.dropped), found.leverages, prepared.kept
 
 
-def _marginals(engine: Engine, unknowns: Unknowns, damping: float, rows_of: Problem | None = None) -> Marginals | None:
+def _marginals(
+    engine: Engine, problem: Problem, unknowns: Unknowns, damping: float, rows: Rows = "none"
+) -> Marginals | None:
     """Return the marginals, or None where there are none."""
     try:
-        return marginals(engine, unknowns, damping, rows_of)
+        return marginals(engine, problem, unknowns, damping, rows)
     except NotPositive:
         return None
 

@@ -40,16 +40,20 @@ class Leverage(NamedTuple):
     reach: Float[Array | np.ndarray, "rows 3 components"]
 
 
-def leverages(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint: Joint) -> tuple[Leverage, ...]:
-    """Return those of the reprojections, then of each prior.
+def pixel_leverage(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint: Joint) -> Leverage:
+    """Return that of the reprojections.
 
     - `inverse`, `joint`: of the equations that the adjustment weighed its rows in, at the same unknowns.
     """
-    of_images = _of_images(system, inverse)
-    priors = (
-        _of_prior(system, prior, unknowns, inverse, of_images, jnp.asarray(joint.points)) for prior in system.priors
-    )
-    return _of_reprojections(system, unknowns, of_images, joint), *priors
+    return _of_reprojections(system, unknowns, _of_images(system, inverse), joint)
+
+
+def prior_leverages(
+    system: System, unknowns: Unknowns, inverse: InverseBlocks, of_points: Float[Array | np.ndarray, "points 3 3"]
+) -> tuple[Leverage, ...]:
+    """Return those of each prior; `of_points`: the points' covariances."""
+    of_images, points = _of_images(system, inverse), jnp.asarray(of_points)
+    return tuple(_of_prior(system, prior, unknowns, inverse, of_images, points) for prior in system.priors)
 
 
 def _of_images(system: System, inverse: InverseBlocks) -> Float[Array, "images columns columns"]:

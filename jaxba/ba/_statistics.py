@@ -7,6 +7,7 @@ numpy (`_reliability.py`, `_variance_components.py`).
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -114,18 +115,34 @@ def statistics(
         "folder": folder,
         "workers": workers,
     }
-    found, leverages, kept = marginals_at("Statistics", problem, loss, with_rows=True, **room)
-    of_observations, *of_priors = leverages
+    found, leverages, kept = marginals_at("Statistics", problem, loss, "all", **room)
+    of_observations = leverages[0]
     std_px = np.repeat(np.asarray(problem.observations.std_px, float)[:, None], 2, axis=1)
     everywhere = Leverage(*(_at(np.asarray(part), kept, problem.num_observations) for part in of_observations))
     std_px[np.setdiff1d(np.arange(len(std_px)), kept)] = np.nan
     observations = row_statistics("observations", std_px, _weight(loss, everywhere), everywhere)
-    priors = tuple(
-        row_statistics(prior.name, _sigmas(prior, np.asarray(rows.residual).shape), _weight(prior.loss, rows), rows)
-        for prior, rows in zip(problem.priors, of_priors, strict=True)
-    )
+    priors = _of_priors(problem, leverages[1:])
     components = variance_components(problem, loss, observations, priors)
     return Statistics(found, problem, observations, priors, components)
+
+
+def prior_statistics(
+    problem: Problem, *, loss: AbstractLoss | None = None, max_memory: float | str | None = None
+) -> tuple[Covariance, tuple[RowStatistics, ...]]:
+    """Return the covariances and the statistics of the priors' rows alone, in as much memory as `covariance` takes.
+
+    Arguments and errors are those of `covariance`.
+    """
+    loss = Linear() if loss is None else loss
+    found, leverages, _ = marginals_at("Statistics", problem, loss, "priors", max_memory=max_memory)
+    return found, _of_priors(problem, leverages)
+
+
+def _of_priors(problem: Problem, leverages: Sequence[Leverage]) -> tuple[RowStatistics, ...]:
+    return tuple(
+        row_statistics(prior.name, _sigmas(prior, np.asarray(rows.residual).shape), _weight(prior.loss, rows), rows)
+        for prior, rows in zip(problem.priors, leverages, strict=True)
+    )
 
 
 def _at(part: Float[np.ndarray, "kept *rest"], kept: Int[np.ndarray, " kept"], count: int) -> np.ndarray:

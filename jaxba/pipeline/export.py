@@ -175,6 +175,8 @@ def _write_control(inputs: Inputs, frame: LocalFrame) -> None:
         mark_rms_px=fit.mark_rms_px,
         over_sigma=fit.over_sigma,
         is_suspect=fit.is_suspect,
+        detectable_m=fit.detectable_m,
+        reach_m=fit.reach_m,
         reasons=[why_empty(*row) for row in zip(known, fit.num_marks, fit.adjusted_m, fit.std_m, strict=True)],
     )
     io.write_csv_control(inputs.folder / "control.csv", table)

@@ -1,5 +1,6 @@
 """What a run tells of control and check points."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -49,7 +50,25 @@ def control_rows(facts: dict[str, Any] | None) -> list[tuple[str, str]]:
         figures = ", ".join(f"{value:.3f}" for value in used.values())
         text = f"RMS {figures} m {', '.join(used)} over {many(group['num'], 'point')}"
         rows.append((role, f"{text}; worst {group['worst']} by {group['worst_m']:.3f} m"))
-    return rows
+    unseen = _unseen((facts or {}).get("points", []))
+    return [*rows, ("control", unseen)] if unseen else rows
+
+
+def _unseen(points: Sequence[dict[str, Any]]) -> str:
+    """Return which error of a control point the others would not show, the largest across and up."""
+    texts = []
+    for axes, word in (((0, 1), "across"), ((2,), "in height")):
+        found = [(max(known), point["name"]) for point in points if (known := _known(point, axes))]
+        if found:
+            largest, name = max(found)
+            size = f"under {largest:.2f} m" if math.isfinite(largest) else "of any size"
+            texts.append(f"an error of {name} {size} {word}")
+    return f"{' and '.join(texts)} would not show" if texts else ""
+
+
+def _known(point: dict[str, Any], axes: Sequence[int]) -> list[float]:
+    values = point.get("detectable_m") or []
+    return [values[axis] for axis in axes if values and values[axis] is not None and not math.isnan(values[axis])]
 
 
 def _group(control: Control, fit: ControlFit, rms_m: np.ndarray, rows: np.ndarray) -> dict[str, Any]:
@@ -78,5 +97,7 @@ def _point(control: Control, fit: ControlFit | None, k: int) -> dict[str, Any]:
         "std_m": fit.std_m[k].tolist(),
         "mark_rms_px": float(fit.mark_rms_px[k]),
         "over_sigma": float(fit.over_sigma[k]),
+        "detectable_m": fit.detectable_m[k].tolist(),
+        "reach_m": fit.reach_m[k].tolist(),
         "suspect": bool(fit.is_suspect[k]),
     }

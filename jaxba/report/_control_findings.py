@@ -85,6 +85,20 @@ def _scatters(count: int, axes: Sequence[str], scatter_m: Sequence[float], state
     )
 
 
+def _shifted(count: int, shift_m: Sequence[float], std_m: Sequence[float], is_controlled: bool) -> str:
+    cure = (
+        "Control and check points may be of two surveys or height systems: compare how both were measured"
+        if is_controlled
+        else "A GNSS base beside its mark, another datum or height system, or the antenna's offset does that, and no "
+        "sigma of a position holds it: correct the positions by it, or use three of the points as control"
+    )
+    return (
+        f"All {count} check points are off alike: block minus survey {along_axes(shift_m, '+.3f')}, where sigmas of "
+        f"{along_axes(std_m, '.2g')} are expected. The block as a whole stands beside its place; its coordinates are "
+        f"not to be used before that is settled. {cure}."
+    )
+
+
 def _contradicts(
     name: str, is_check: bool, residual_m: Sequence[float], over_sigma: float, limit: float, method: str
 ) -> str:
@@ -116,6 +130,7 @@ CONTROL_WORDS: dict[str, Callable[..., str]] = {
     "marks off": _marks_off,
     "marks disagree": _marks_disagree,
     "control scatters": _scatters,
+    "check points shifted": _shifted,
     "control point contradicts": _contradicts,
     "gnss off control": _gnss_off,
 }

@@ -69,7 +69,11 @@ class ControlFit:
     - `adjusted_m`: the point in the result, local frame. `residual_m`: adjusted minus surveyed, east, north, up.
     - `std_m`: predicted sigma of the adjusted point; NaN along an axis that nothing measured holds the block along, and
       after a fit of 7 or 12 parameters that of its marks alone. `num_marks`: used. `mark_rms_px`: of their errors.
-    - `over_sigma`: the largest of the three differences between point and survey over its predicted sigma.
+    - `over_sigma`: the largest of the three differences between survey and what all else says of the point, over its
+      predicted sigma. Of a check point what its fellows have in common is no part of it, where that is significant.
+    - `detectable_m`: of a control point in the adjustment, the smallest error an axis that a test of 0.1% finds in four
+      of five cases; infinite where nothing checks it. `reach_m`: by how much an error of that size moves the point.
+    - `check_shift_m`, `check_shift_std_m`: what all check points are off in common, and its sigma; NaN of fewer than 3.
     - `is_suspect`: over the limit of the blunder test.
     - `scale`: that sigmas of control were multiplied by, horizontal and vertical, since the points scatter by that.
     - `method`: by which control was used; `none` where it could not be.
@@ -83,6 +87,10 @@ class ControlFit:
     num_marks: Int[np.ndarray, " points"]
     mark_rms_px: Float[np.ndarray, " points"]
     over_sigma: Float[np.ndarray, " points"]
+    detectable_m: Float[np.ndarray, "points 3"]
+    reach_m: Float[np.ndarray, "points 3"]
+    check_shift_m: Float[np.ndarray, "3"]
+    check_shift_std_m: Float[np.ndarray, "3"]
     is_suspect: Bool[np.ndarray, " points"]
     method: str
     control_rms_m: Float[np.ndarray, "3"]
@@ -101,6 +109,10 @@ class ControlFit:
             num_marks=np.zeros(num_points, np.int64),
             mark_rms_px=np.full(num_points, np.nan),
             over_sigma=np.full(num_points, np.nan),
+            detectable_m=unknown,
+            reach_m=unknown,
+            check_shift_m=np.full(3, np.nan),
+            check_shift_std_m=np.full(3, np.nan),
             is_suspect=np.zeros(num_points, bool),
             method="none",
             control_rms_m=np.full(3, np.nan),

@@ -26,6 +26,7 @@ def control_findings(
             *_too_few(block, control, fit, reference),
             *_wrong_marks(block, adjusted, control, fit, photos),
             *_scatter(control, fit),
+            *_shifted(control, fit),
             *_suspects(control, fit),
             *_offset(block, fit, reference),
         ]
@@ -94,6 +95,24 @@ def _scatter(control: Control, fit: ControlFit) -> list[Finding]:
         return []
     count = int(known.sum())
     return [Finding.of("control scatters", count=count, axes=axes, scatter_m=scatter_m, stated_m=stated_m)]
+
+
+def _shifted(control: Control, fit: ControlFit) -> list[Finding]:
+    """Check points that are all off alike: the block's place, and none of them, is wrong."""
+    with np.errstate(invalid="ignore"):
+        significant = np.abs(fit.check_shift_m) > BLUNDER * fit.check_shift_std_m
+    if not significant.any():
+        return []
+    count = int(np.count_nonzero(control.is_check & np.isfinite(fit.adjusted_m).all(axis=1)))
+    return [
+        Finding.of(
+            "check points shifted",
+            count=count,
+            shift_m=fit.check_shift_m.tolist(),
+            std_m=fit.check_shift_std_m.tolist(),
+            is_controlled=fit.method != "none",
+        )
+    ]
 
 
 def _suspects(control: Control, fit: ControlFit) -> list[Finding]:

@@ -3,11 +3,13 @@
 **Residuals** are adjusted minus surveyed, along local east, north, up. A control point in the adjustment is where that
 put it; all others are intersected from their marks by the adjusted poses.
 
-**Blunder test.** A control point intersected from its marks alone is compared with its surveyed coordinates. The
-difference over its sigma (of the survey, of the marks, and of the poses as tie points around show it) is over 3.29 by
-chance in one of a thousand. In a fit, whose parameters a wrong point bends, it is the standardised residual
-`v / sigma_v` with `sigma_v^2` the diagonal of `S - A (A^T S^-1 A)^-1 A^T` (Baarda 1968), over their own scatter where
-that is larger; the point with the largest one is left out and the fit made anew, as long as enough are left.
+**Blunder test.** A control point in the adjustment is compared with what marks, photos, positions and the other control
+points say of it (Baarda's test, see `jaxba.ba.RowStatistics`), a check point with where its marks place it. The
+difference over its sigma is over 3.29 by chance in one of a thousand. What all check points are off in common (a GNSS
+base, a datum) is told as such and blamed on none of them. In a fit, whose parameters a wrong point bends, it is the
+standardised residual `v / sigma_v` with `sigma_v^2` the diagonal of `S - A (A^T S^-1 A)^-1 A^T` (Baarda 1968), over
+their own scatter where that is larger; the point with the largest one is left out and the fit made anew, as long as
+enough are left.
 
 **Affine.** Twelve parameters near the similarity, each of their nine coefficients held to it with a sigma of 1%: flat
 control tells nothing of how heights are sheared, and that then stays as it is. A camera's pose cannot be sheared, so it
@@ -31,6 +33,7 @@ BLUNDER = 3.29  # sigmas: one of a thousand by chance
 LEAST_OF = {"helmert": 3, "affine": 4}
 _SHEAR = 0.01
 _AROUND = 20  # tie points that tell what poses contribute to a point's sigma
+_LEAST_IN_COMMON = 3
 _CHECK_OFF = 5.0  # sigmas: of a check point nobody expects more
 IDENTITY = np.eye(3, 4)
 
@@ -63,7 +66,8 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
     control = replace(control, std_m=control.std_m * scale[[0, 0, 1]])
     held = np.any(np.isfinite(sigmas.point_std_m), axis=0)  # the axes that something measured holds the block along
     found = intersect(block, control, adjusted.mark_used)
-    variance = _pose_variance(adjusted, sigmas, found) + found.variance_m2
+    of_poses = _pose_variance(adjusted, sigmas, found)
+    variance = of_poses + found.variance_m2
     method, affine, left_out = "none", IDENTITY, np.zeros(control.num_points, bool)
     scores = None
     if control.method == "adjust" and adjusted.control is not None:
@@ -83,9 +87,18 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
     points = apply_affine(affine, found.point_m)
     off = np.where(np.isfinite(control.std_m), points - control.xyz_m, np.nan)
     std = np.sqrt(np.where(np.isfinite(control.std_m), control.std_m, np.nan) ** 2 + variance)
-    over = _largest(np.abs(off / std))
+    shift, shift_std = _common(off, std, of_poses, control.is_check)
+    with np.errstate(invalid="ignore"):
+        is_shifted = np.abs(shift) > BLUNDER * shift_std
+    in_common = np.where(control.is_check[:, None] & is_shifted, shift, 0.0)
+    over = _largest(np.abs((off - in_common) / std))
+    detectable, reach = (np.full(off.shape, np.nan) for _ in range(2))
     if scores is not None:
         over = np.where(use, scores, over)
+    if sigmas.control is not None and adjusted.control is not None and method == "adjust":
+        rows = adjusted.control.rows
+        over[rows] = _largest(np.abs(sigmas.control.test))
+        detectable[rows], reach[rows] = sigmas.control.detectable, sigmas.control.reach_m
     if method == "adjust" and adjusted.control is not None:
         points = points.copy()
         points[adjusted.control.rows] = adjusted.control.start_m
@@ -110,6 +123,10 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
             num_marks=found.num_marks,
             mark_rms_px=_mark_rms(found, control, adjusted.mark_used),
             over_sigma=over,
+            detectable_m=detectable,
+            reach_m=reach,
+            check_shift_m=shift,
+            check_shift_std_m=shift_std,
             is_suspect=suspect,
             method=method,
             control_rms_m=_rms(residual[~control.is_check]),
@@ -118,6 +135,29 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
             scale=scale,
         ),
     )
+
+
+def _common(
+    off_m: Float[np.ndarray, "points 3"],
+    std_m: Float[np.ndarray, "points 3"],
+    of_poses_m2: Float[np.ndarray, "points 3"],
+    is_check: Bool[np.ndarray, " points"],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Return what check points are off in common, an axis, and its sigma; NaN where fewer than three are known.
+
+    - `std_m`: of each difference. `of_poses_m2`: its part that the poses bring, the same for points near each other:
+      the mean does not make it smaller.
+    """
+    shift, std = np.full(3, np.nan), np.full(3, np.nan)
+    for axis in range(3):
+        mine = is_check & np.isfinite(off_m[:, axis]) & np.isfinite(std_m[:, axis])
+        if mine.sum() < _LEAST_IN_COMMON:
+            continue
+        own = np.maximum(std_m[mine, axis] ** 2 - of_poses_m2[mine, axis], 1e-12)
+        weight = 1 / own / np.sum(1 / own)
+        shift[axis] = np.sum(weight * off_m[mine, axis])
+        std[axis] = np.sqrt(np.sum(weight**2 * own) + np.mean(of_poses_m2[mine, axis]))
+    return shift, std
 
 
 def _without_absolute(sigmas: Uncertainty) -> Uncertainty:

@@ -33,7 +33,7 @@ class GnssFit:
 
     - `residual_m`: of every registered image, NaN where nothing was measured or not used.
     - `is_outlier`: beyond three robust sigmas. `rms_m`: an axis over the `num` others; None without any.
-    - `scale`: robust sigma of the residuals, an axis, metres.
+    - `scale_m`: robust sigma of the residuals about their median `middle_m`, an axis, metres.
     """
 
     residual_m: Float[np.ndarray, "images 3"]
@@ -41,26 +41,29 @@ class GnssFit:
     rms_m: tuple[float, float, float] | None
     num: int
     scale_m: Float[np.ndarray, "3"]
+    middle_m: Float[np.ndarray, "3"]
 
 
 def gnss_fit(block: Block, reference: Reference) -> GnssFit:
     """Return how well the block fits its measured positions.
 
     An outlier's residual is over three sigmas in some axis, where sigma is the larger of the position's own and the
-    residuals' robust one (1.4826 MAD about zero).
+    residuals' robust one. Both are counted from the median: what all have in common is no error of each.
     """
     used = used_positions(block, reference)
     index = block.image_index
     known = used[:, None] & np.isfinite(reference.std_m[index]) & np.isfinite(reference.xyz_m[index])
     residual = np.where(known, block.centers_m - reference.xyz_m[index], np.nan)
+    columns = list(zip(residual.T, known.T, strict=True))
+    middle = np.array([np.median(r[k]) if k.any() else np.nan for r, k in columns])
     scale = np.array(
-        [1.4826 * np.median(np.abs(r[k])) if k.any() else np.nan for r, k in zip(residual.T, known.T, strict=True)]
+        [1.4826 * np.median(np.abs(r[k] - m)) if k.any() else np.nan for (r, k), m in zip(columns, middle, strict=True)]
     )
     own = np.where(known, reference.std_m[index], np.nan)
     # a plain receiver's sigma of metres is mostly a common offset: what scatters within a flight is judged by itself
     limit = _OUTLIER * np.where(own > 1.0, np.maximum(scale, own / 3), np.maximum(scale, own))
     with np.errstate(invalid="ignore"):
-        outlier = used & np.any(np.abs(residual) > limit, axis=1)
+        outlier = used & np.any(np.abs(residual - middle) > limit, axis=1)
     inlier = used & ~outlier
     rms = None
     if inlier.any():
@@ -68,7 +71,7 @@ def gnss_fit(block: Block, reference: Reference) -> GnssFit:
             squared = [np.nanmean(c**2) if np.isfinite(c).any() else np.nan for c in residual[inlier].T]
         east, north, up = (float(np.sqrt(s)) for s in squared)
         rms = (east, north, up)
-    return GnssFit(residual, outlier, rms, int(inlier.sum()), scale)
+    return GnssFit(residual, outlier, rms, int(inlier.sum()), scale, middle)
 
 
 def findings(
@@ -177,7 +180,7 @@ def _scatter(adjusted: Adjusted, reference: Reference, fit: GnssFit) -> list[Fin
     if not used_positions(adjusted.block, reference).any():
         return []
     stated = np.median(reference.std_m[index[used_positions(adjusted.block, reference)]], axis=0)
-    ratio = np.where(fit.is_outlier[:, None], np.nan, fit.residual_m / reference.std_m[index])
+    ratio = np.where(fit.is_outlier[:, None], np.nan, (fit.residual_m - fit.middle_m) / reference.std_m[index])
     known = np.count_nonzero(np.isfinite(ratio), axis=0)
     # the quantile of chi-square; `scipy.stats`, which has it by name, takes 0.5 s to import
     by_chance = 2 * gammaincinv(np.maximum(known, 1) / 2, 1 - _SIGNIFICANCE)

@@ -2,7 +2,9 @@
 
 **Positions** are priors with a loss that lets a single bad fix go (`POSITION_LOSS`): at four sigmas a fix has a quarter
 of its weight left, at six a tenth. Sigmas are those of the reference times `position_scale`, for receivers whose
-positions scatter more than they claim.
+positions scatter more than they claim. Without control the first two rounds take positions at their word and let go
+later: with the principal point not yet adjusted, positions of lines flown up and down scatter by that error, and sigmas
+enlarged to it would leave it as it is.
 
 **Attitudes** of one flight err alike (a compass, a gimbal's zero), so that all of them together count as one
 measurement: each sigma is multiplied by the root of their number. They hold the block where positions cannot: a single
@@ -57,6 +59,7 @@ def to_problem(
     anchor: Block | None = None,
     std_px: float = 1.0,
     position_scale: Float[np.ndarray, "3"] | None = None,
+    let_go: float = 1.0,
     held: Sequence[str] = (),
     control: ControlPart | None = None,
 ) -> Problem:
@@ -65,6 +68,7 @@ def to_problem(
     - `anchor`: the block as it started, which holds what nothing measured holds, and gives the focal length's start
       where the photos give none; the block itself if None.
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
+    - `let_go`: times the residual at which a position's loss lets it go.
     - `held`: names of the camera model's parameters that stay as they are.
     - `control`: points and observations that follow the block's own.
 
@@ -79,7 +83,7 @@ def to_problem(
     inside = np.clip(block.camera_parameters, natural.lower, natural.upper)
     names = model.parameter_names()
     priors: list[AbstractPrior] = [
-        *_position_priors(anchor, reference, position_scale),
+        *_position_priors(anchor, reference, position_scale, let_go),
         *_attitude_priors(anchor, reference),
         _intrinsics_prior(natural, inside, [name in held for name in names]),
     ]
@@ -163,7 +167,7 @@ def _intrinsics_prior(
 
 
 def _position_priors(
-    anchor: Block, reference: Reference, scale: Float[np.ndarray, "3"] | None
+    anchor: Block, reference: Reference, scale: Float[np.ndarray, "3"] | None, let_go: float
 ) -> tuple[PositionPrior, ...]:
     used = used_positions(anchor, reference)
     extent = np.linalg.norm(anchor.centers_m - np.median(anchor.centers_m, axis=0), axis=1)
@@ -181,8 +185,8 @@ def _position_priors(
     xyz, std = reference.xyz_m[index].copy(), _sigma(reference, index, scale)
     nowhere = ~np.isfinite(std).any(axis=0)  # no photo has a height: they stay where they start
     xyz[:, nowhere], std[:, nowhere] = anchor.centers_m[rows][:, nowhere], weak
-    priors = PositionPrior(image_index=rows.astype(np.int32), xyz=np.nan_to_num(xyz), std_m=std, loss=POSITION_LOSS)
-    return (priors,)
+    loss = GemanMcClure(POSITION_LOSS.f_scale * let_go)
+    return (PositionPrior(image_index=rows.astype(np.int32), xyz=np.nan_to_num(xyz), std_m=std, loss=loss),)
 
 
 def _sigma(reference: Reference, index: np.ndarray, scale: np.ndarray | None) -> Float[np.ndarray, "n 3"]:

@@ -37,6 +37,7 @@ _log = logging.getLogger(__name__)
 
 _SPARE = 0.03  # room for tracks that pruning cuts in two
 _LEAST_POSITIONS = 6
+_TRUSTING_ROUNDS = 2
 _TELL_EVERY_S = 1.0
 
 
@@ -125,12 +126,16 @@ class Rounds:
         settings = self.settings
         model = LOSSES[settings.loss]
         loss = Linear() if model is Linear else model(f_scale=settings.f_scale / std_px)  # type: ignore[call-arg]
-        scale = position_scale(block, self.reference)
+        scale, let_go = position_scale(block, self.reference), 1.0
         scale_of_control = None
         if is_later and self.control.num_points:
             is_free = int(used_positions(block, self.reference).sum()) < LEAST_TO_PLACE
             scale_of_control = control_scale(block, self.control, mark_used, is_free=is_free)
         control = control_part(block, self.control, mark_used, scale_of_control)
+        if control is None and number <= _TRUSTING_ROUNDS and max_nfev < settings.max_nfev:
+            # how positions scatter about a block whose camera is not yet right tells nothing of them
+            let_go = float(np.max(scale / np.minimum(scale, 1.0)))
+            scale = np.minimum(scale, 1.0)
         offset_m = gnss_offset(block, self.reference, control, is_later=is_later)
         reference = with_offset(self.reference, offset_m)
         held = [name for name in CAMERAS[block.camera_model].parameter_names() if name not in free]
@@ -143,6 +148,7 @@ class Rounds:
                 anchor=self.anchor,
                 std_px=std_px,
                 position_scale=scale,
+                let_go=let_go,
                 held=held,
                 control=control,
             )

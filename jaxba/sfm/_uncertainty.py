@@ -32,7 +32,8 @@ from jaxtyping import Float
 from scipy.special import digamma, polygamma
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import Covariance, covariance
+from jaxba.ba import Covariance, Problem, RowStatistics, covariance, prior_statistics
+from jaxba.geometry import AbstractLoss
 from jaxba.scene import Block, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._cores import on_all_cores
@@ -52,6 +53,7 @@ class Uncertainty:
 
     - `position_std_m`, `point_std_m`: world. `intrinsics_std`: in the parameters' units, 0 for what is fixed.
     - `variance_factor`: of the residuals, by the sigmas that weighed observations, tails aside; NaN likewise.
+    - `control`: redundancy, tests and reliability of the surveyed coordinates, a row for each of `Adjusted.control`.
     """
 
     position_std_m: Float[np.ndarray, "images 3"]
@@ -60,6 +62,7 @@ class Uncertainty:
     variance_factor: float
     why_not: str | None = None
     covariance: Covariance | None = None
+    control: RowStatistics | None = None
 
 
 def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
@@ -74,7 +77,7 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     problem = dataclasses.replace(adjusted.problem, observations=observations)
     loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
-        found = covariance(problem, loss=loss, max_memory=adjusted.max_memory)
+        found, priors = _covariance_and_priors(problem, loss, adjusted)
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")
@@ -94,7 +97,17 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
             "no scale to give them in. Add GNSS positions or ground control."
         )
     factor = found.variance_factor * times**2  # positions' part of the cost is small
-    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found)
+    control = next((rows for rows in priors if rows.name == "control"), None)
+    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found, control)
+
+
+def _covariance_and_priors(
+    problem: Problem, loss: AbstractLoss, adjusted: Adjusted
+) -> tuple[Covariance, tuple[RowStatistics, ...]]:
+    """Return the covariances; with control the statistics of the priors too."""
+    if adjusted.control is None:
+        return covariance(problem, loss=loss, max_memory=adjusted.max_memory), ()
+    return prior_statistics(problem, loss=loss, max_memory=adjusted.max_memory)
 
 
 def spread(adjusted: Adjusted) -> float:

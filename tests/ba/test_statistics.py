@@ -7,7 +7,7 @@ import pytest
 from dense_reference import Dense, loss_derivatives
 from test_covariance import CASES
 
-from jaxba.ba import Problem, RowStatistics, Statistics, Step, statistics
+from jaxba.ba import Problem, RowStatistics, Statistics, Step, prior_statistics, statistics
 from jaxba.geometry import Linear
 
 _SOLVED = 24  # rows of a group that are left out of the dense equations, which are solved anew
@@ -124,3 +124,15 @@ def places(problem: Problem, dense: Dense) -> tuple[np.ndarray, np.ndarray]:
     place = np.full(ends[-1], -1)
     place[dense.flat(step).astype(int) - 1] = np.arange(dense.size)
     return place[step.points.astype(int) - 1], place[step.poses.astype(int) - 1][:, 3:]
+
+
+def test_statistics_of_priors_alone_are_the_same():
+    make, loss = CASES["shared camera, every prior"]
+    problem = make()
+    covariance, rows = prior_statistics(problem, loss=loss)
+    found = statistics(problem, loss=loss, max_observations=problem.num_observations / 2)
+    np.testing.assert_allclose(covariance.points, found.covariance.points, rtol=1e-9, atol=1e-15)
+    for one, other in zip(rows, found.priors, strict=True):
+        assert one.name == other.name
+        for name in ("redundancy", "test", "row_test", "detectable", "reach_m"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-9)

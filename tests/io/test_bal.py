@@ -145,7 +145,11 @@ PRIOR = LeverArmPrior(xyz=np.zeros((1, 3)), std_m=np.ones((1, 3)), loss=Cauchy()
         (lambda p: p.fix(poses=[0]), "fixed poses, points or intrinsics"),
         (lambda p: p.bound(k1=(-1.0, 1.0)), "bounds"),
         (change(lever_arm=np.ones(3)), "a lever arm"),
-        (lambda p: Problem(**{n: getattr(p, n) for n in list(vars(p))[:-1]}, image_names=("a", "b")), "image names"),
+        (change(position_offset=np.ones((1, 3))), "an offset of positions"),
+        (
+            lambda p: Problem(**{n: v for n, v in vars(p).items() if n != "image_names"}, image_names=("a", "b")),
+            "names",
+        ),
     ],
 )
 def test_writer_refuses_what_bal_cannot_hold(tmp_path: Path, changed, message: str):

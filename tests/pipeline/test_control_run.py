@@ -55,7 +55,9 @@ def test_summary_and_terminal_tell_control_and_check_apart(run: Run) -> None:
     assert {point["role"] for point in facts["points"]} == {"control", "check"}
     # positions of 3 and 5 cm agree with control, and hold the block with it
     assert len(facts["gnss_minus_control_m"]) == 3 and max(map(abs, facts["gnss_minus_control_m"])) < 0.1
-    (first, control), (second, check) = control_rows(facts)
+    (first, control), (second, check), (third, unseen) = control_rows(facts)
+    largest = max((point["detectable_m"][2], point["name"]) for point in facts["points"] if point["role"] == "control")
+    assert third == "control" and f"{largest[1]} under {largest[0]:.2f} m in height would not show" in unseen
     assert (first, second) == ("control", "check")
     assert control.startswith("RMS 0.0") and "m east, north, up over 5 points; worst gcp" in control
     assert "worst check" in check

@@ -227,6 +227,25 @@ CASES = [
     ),
     (
         Finding.of(
+            "check points shifted", count=5, shift_m=[1.0, -0.8, 0.79], std_m=[0.02, 0.02, 0.06], is_controlled=False
+        ),
+        "All 5 check points are off alike: block minus survey east +1.000, north -0.800, up +0.790 m, where sigmas of "
+        "east 0.02, north 0.02, up 0.06 m are expected. The block as a whole stands beside its place; its coordinates "
+        "are not to be used before that is settled. A GNSS base beside its mark, another datum or height system, or "
+        "the antenna's offset does that, and no sigma of a position holds it: correct the positions by it, or use three of "
+        "the points as control.",
+    ),
+    (
+        Finding.of(
+            "check points shifted", count=3, shift_m=[0.0, 0.0, 0.4], std_m=[NAN, NAN, 0.06], is_controlled=True
+        ),
+        "All 3 check points are off alike: block minus survey east +0.000, north +0.000, up +0.400 m, where sigmas of "
+        "up 0.06 m are expected. The block as a whole stands beside its place; its coordinates are not to be used "
+        "before that is settled. Control and check points may be of two surveys or height systems: compare how both "
+        "were measured.",
+    ),
+    (
+        Finding.of(
             "control point contradicts",
             name="g1",
             is_check=False,

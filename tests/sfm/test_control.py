@@ -18,6 +18,7 @@ from jaxba.sfm import (
     adjust,
     apply_control,
     control_findings,
+    gnss_fit,
     place_by_control,
     to_problem,
     uncertainty as uncertainty_of,
@@ -294,3 +295,47 @@ def test_good_positions_are_moved_only_where_they_contradict_control(survey: Sim
         np.testing.assert_allclose(found.fit.gnss_minus_control_m, off_m, atol=0.15)
         assert ((adjusted.gnss_offset_m != 0) == (off_m != 0)).all()
         assert (found.fit.check_rms_m < [0.04, 0.04, 0.08]).all()
+
+
+@pytest.fixture(scope="module")
+def rtk(survey: Simulated) -> Simulated:
+    """The same flight with positions of 2 and 4 cm."""
+    std_m = np.tile([0.02, 0.02, 0.04], (12, 1))
+    centers = np.asarray(survey.survey.truth.poses.center)
+    measured = centers + std_m * np.random.default_rng(5).normal(size=centers.shape)
+    return replace(survey, reference=replace(survey.reference, xyz_m=measured, std_m=std_m))
+
+
+def test_a_shift_that_all_check_points_have_is_told_and_blamed_on_none(rtk: Simulated, points: Control) -> None:
+    """A base that stands beside its mark, and no control point: all of the block is off, no check point is wrong."""
+    shift = np.array([1.0, -0.8, 0.8])
+    away = replace(rtk, reference=replace(rtk.reference, xyz_m=rtk.reference.xyz_m + shift))
+    checks = replace(points, is_check=np.ones(10, bool))
+    for given, expected in ((rtk, np.zeros(3)), (away, shift)):
+        made = run(given, checks)
+        fit = made[1].fit
+        assert not fit.is_suspect.any() and (fit.over_sigma < 4).all()
+        over = (fit.check_shift_m - expected) / fit.check_shift_std_m
+        assert np.abs(over).max() < 3.5 and (fit.check_shift_std_m < 0.15).all()
+        found = {finding.kind: finding.figures for finding in found_on(given, checks, made)}
+        assert ("check points shifted" in found) == expected.any() and "control point contradicts" not in found
+        gnss = gnss_fit(made[1].block, given.reference)
+        assert not gnss.is_outlier.any() and (gnss.scale_m < 0.06).all()
+    assert found["check points shifted"]["count"] == 10 and not found["check points shifted"]["is_controlled"]
+    # one that is wrong beside the shift is named, and it alone
+    wrong = run(away, moved(checks, 3, [0.0, 0.0, 0.6]))[1].fit
+    assert np.flatnonzero(wrong.is_suspect).tolist() == [3]
+
+
+def test_reliability_of_control_is_what_a_planted_error_shows(rtk: Simulated, points: Control) -> None:
+    """An error as large as `detectable_m` shifts the test by 4.13 sigmas, and the point by `reach_m`."""
+    clean = run(rtk, points)[1].fit
+    control = np.flatnonzero(~points.is_check)
+    assert np.isfinite(clean.detectable_m[control]).all() and np.isnan(clean.detectable_m[points.is_check]).all()
+    assert (clean.detectable_m[control] > 4.13 * points.std_m[control]).all() and (clean.over_sigma < 4).all()
+    size = clean.detectable_m[3, 2]
+    wrong = run(rtk, moved(points, 3, [0.0, 0.0, size]))[1].fit
+    # signs of chance before: the test moves by 4.13 from where it was; Huber's loss lets go a little
+    assert 4.13 - clean.over_sigma[3] - 0.7 < wrong.over_sigma[3] < 4.13 + clean.over_sigma[3] + 0.7
+    pulled = wrong.adjusted_m[3, 2] - clean.adjusted_m[3, 2]
+    assert pulled == pytest.approx(clean.reach_m[3, 2], rel=0.3)

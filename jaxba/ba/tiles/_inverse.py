@@ -7,14 +7,14 @@ the whole is nowhere: of a node's part its children's parts are taken, and it go
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxba.ba._compiler import call_compiled
-from jaxba.ba._leverage import Leverage, leverages
+from jaxba.ba._leverage import Leverage, pixel_leverage, prior_leverages
 from jaxba.ba._linearise import Linearisation
 from jaxba.ba._plan_shape import num_rows
 from jaxba.ba._point_marginals import InverseBlocks, Joint, Squares, joint_marginals, point_marginals, squares
@@ -24,6 +24,9 @@ from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Call, Engine
 
+Rows = Literal["none", "priors", "all"]
+"""Whose leverages are asked for: of all rows those of the reprojections come first."""
+
 
 class Marginals(NamedTuple):
     """Covariances in the problem's order.
@@ -31,7 +34,7 @@ class Marginals(NamedTuple):
     - `blocks`: of images. `border`: joint, of the shared unknowns.
     - `block_inflation`, `border_inflation`: each variance over what it were if all other unknowns were known.
     - `squares`: of the reprojections and the priors, by tiles.
-    - `leverages`: of the reprojections and the priors, in their order, where they were asked for; else none.
+    - `leverages`: of the rows that were asked for, in the problem's order.
     """
 
     blocks: Float[np.ndarray, "images block block"]
@@ -52,7 +55,7 @@ class _OfTile(NamedTuple):
     leverages: tuple[Leverage, ...]
 
 
-def compile_marginals(engine: Engine, unknowns: Unknowns, rows_of: Problem | None = None) -> None:
+def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none") -> None:
     """Compile what `marginals` calls, side by side; without it that happens when it is called."""
 
     def calls(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
@@ -65,20 +68,24 @@ def compile_marginals(engine: Engine, unknowns: Unknowns, rows_of: Problem | Non
             np.zeros((shape.border, shape.border)),
         )
         of_points = system, model, inverse, np.zeros(())
-        if rows_of is None:
-            return [Call(point_marginals, of_points), Call(squares, (system, part))]
         joint = jax.eval_shape(joint_marginals, *of_points)
-        rows = Call(leverages, (system, part, inverse, joint))
-        return [Call(joint_marginals, of_points), Call(squares, (system, part)), rows]
+        of_all = joint_marginals if rows == "all" else point_marginals
+        found = [Call(of_all, of_points), Call(squares, (system, part))]
+        if rows != "none":
+            found.append(Call(prior_leverages, (system, part, inverse, joint.points)))
+        if rows == "all":
+            found.append(Call(pixel_leverage, (system, part, inverse, joint)))
+        return found
 
     engine.compile(unknowns, calls)
 
 
-def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0, rows_of: Problem | None = None) -> Marginals:
+def marginals(
+    engine: Engine, problem: Problem, unknowns: Unknowns, damping: float = 0.0, rows: Rows = "none"
+) -> Marginals:
     """Return the marginals at some unknowns.
 
-    - `damping`: that every diagonal is raised by, as a share of it. `rows_of`: the problem whose rows' leverages are
-      asked for.
+    - `problem`: the engine's. `damping`: that every diagonal is raised by, as a share of it.
 
     Raises `NotPositive` where the equations have no inverse.
     """
@@ -105,20 +112,21 @@ def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0, rows_of:
                 fronts.memory.give_back(whole)
 
     def of_tile(number: int, rest: np.ndarray) -> _OfTile:
-        return _of_tile(engine, unknowns, number, rest, corner, damping, with_rows=rows_of is not None)
+        return _of_tile(engine, unknowns, number, rest, corner, damping, rows)
 
     points = np.zeros((len(tree.tile_of_point), 3, 3))
     parts: list[tuple[Squares, ...]] = [()] * len(engine.tiles)
-    of_rows = () if rows_of is None else _empty(rows_of)
+    of_rows = _empty(problem, rows)
     for found in engine.each_tile(of_tile, descend()):
         tile, _ = engine.tiles[found.number]
         own = tree.node_of_image[tile.order] <= tree.tiles[found.number]
         blocks[tile.order[own]] = found.blocks[own]
         points[tile.points[tile.plan.point_order]] = found.points
         parts[found.number] = found.squares
-        for whole, part, rows in zip(of_rows, found.leverages, (tile.rows, *tile.prior_rows), strict=False):
+        places = (tile.rows, *tile.prior_rows) if rows == "all" else tile.prior_rows
+        for whole, part, place in zip(of_rows, found.leverages, places, strict=bool(of_rows)):
             for all_rows, own_rows in zip(whole, part, strict=True):
-                all_rows[rows] = own_rows
+                all_rows[place] = own_rows
     groups = [Squares(*map(np.concatenate, zip(*group, strict=True))) for group in zip(*parts, strict=True)]
     return Marginals(
         blocks,
@@ -131,12 +139,14 @@ def marginals(engine: Engine, unknowns: Unknowns, damping: float = 0.0, rows_of:
     )
 
 
-def _empty(problem: Problem) -> tuple[Leverage, ...]:
+def _empty(problem: Problem, rows: Rows) -> tuple[Leverage, ...]:
     """Return arrays for the leverages of all rows."""
+    if rows == "none":
+        return ()
     own = Unknowns(problem.poses, np.zeros(problem.free.intrinsics.shape), problem.antenna, problem.points)
-    components = [2, *(jax.eval_shape(prior.residual, own).shape[0] for prior in problem.priors)]
-    counts = [problem.num_observations, *map(num_rows, problem.priors)]
-    shapes = zip(counts, components, strict=True)
+    shapes = [(num_rows(prior), jax.eval_shape(prior.residual, own).shape[0]) for prior in problem.priors]
+    if rows == "all":
+        shapes.insert(0, (problem.num_observations, 2))
     return tuple(Leverage(np.zeros((n, c)), np.zeros((n, c, c)), np.zeros((n, 3, c))) for n, c in shapes)
 
 
@@ -147,8 +157,7 @@ def _of_tile(
     rest: np.ndarray,
     corner: np.ndarray,
     damping: float,
-    *,
-    with_rows: bool,
+    rows: Rows,
 ) -> _OfTile:
     shape, fronts = engine.shape, engine.fronts
     tile, of_tile = engine.tiles[number]
@@ -174,17 +183,19 @@ def _of_tile(
     inverse = InverseBlocks(images, pairs, border, corner)
     found = jax.tree.map(np.asarray, call_compiled(squares, system, own))
     of_points = system, model, inverse, np.array(damping)
-    of_rows: tuple[Leverage, ...] = ()
-    if with_rows:
+    groups: list[Leverage] = []
+    takes = [np.arange(len(places)) for places in tile.prior_rows]  # what follows is padding
+    if rows == "all":
         joint: Joint = call_compiled(joint_marginals, *of_points)
         points = joint.points
-        of_rows = tuple(call_compiled(leverages, system, own, inverse, joint))
-        seen = tile.plan.row_observation >= 0
-        place = np.argsort(tile.plan.row_observation[seen])  # no two rows are of one observation
-        takes = [np.flatnonzero(seen)[place], *(slice(len(rows)) for rows in tile.prior_rows)]
-        of_rows = tuple(Leverage(*(np.asarray(a)[t] for a in part)) for part, t in zip(of_rows, takes, strict=True))
+        groups.append(call_compiled(pixel_leverage, system, own, inverse, joint))
+        seen = np.flatnonzero(tile.plan.row_observation >= 0)
+        takes.insert(0, seen[np.argsort(tile.plan.row_observation[seen])])
     else:
         points = call_compiled(point_marginals, *of_points)
+    if rows != "none":
+        groups += call_compiled(prior_leverages, system, own, inverse, points)
+    of_rows = tuple(Leverage(*(np.asarray(part)[take] for part in of)) for of, take in zip(groups, takes, strict=False))
     count = len(tile.order)
     return _OfTile(number, images[:count], np.asarray(points)[: len(tile.points)], found, of_rows)
 

@@ -232,8 +232,8 @@ CASES = [
         "All 5 check points are off alike: block minus survey east +1.000, north -0.800, up +0.790 m, where sigmas of "
         "east 0.02, north 0.02, up 0.06 m are expected. The block as a whole stands beside its place; its coordinates "
         "are not to be used before that is settled. A GNSS base beside its mark, another datum or height system, or "
-        "the antenna's offset does that, and no sigma of a position holds it: correct the positions by it, or use three of "
-        "the points as control.",
+        "the antenna's offset does that, and no sigma of a position holds it: correct the positions by it, or use "
+        "three of the points as control.",
     ),
     (
         Finding.of(

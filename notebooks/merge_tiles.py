@@ -91,7 +91,7 @@ print(exact.result, "after", int(exact.num_steps), "steps, focal length", np.rou
 def cost(block):
     """Half the sum of squared residuals over their sigmas."""
     errors = jaxba.reprojection_errors(block) / block.observations.std_px
-    unknowns = jaxba.ba.Unknowns(block.poses, block.cameras.parameters, block.lever_arm, block.points)
+    unknowns = jaxba.ba.Unknowns(block.poses, block.cameras.parameters, block.antenna, block.points)
     return 0.5 * float(np.sum(errors**2) + sum(np.sum(prior.residual(unknowns) ** 2) for prior in block.priors))
 
 

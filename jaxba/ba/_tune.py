@@ -258,7 +258,7 @@ class _CheckPointScore(eqx.Module):
 
     @eqx.filter_jit
     def __call__(self, values: Any) -> Float[Array, ""]:
-        _, _, points, _ = values
+        _, _, points, *_ = values
         return jnp.mean(jnp.sum((jnp.asarray(points)[self.index] - self.xyz) ** 2, axis=1))
 
 
@@ -271,7 +271,7 @@ class _HeldOutScore(eqx.Module):
     @eqx.filter_jit
     def __call__(self, values: Any) -> Float[Array, ""]:
         seen = self.left_out
-        poses, cameras, points, _ = values
+        poses, cameras, points, *_ = values
         poses = jax.tree.map(lambda leaf: jnp.asarray(leaf)[seen.image_index], poses)
         cameras = jax.tree.map(lambda leaf: jnp.asarray(leaf)[self.camera], cameras)
         pixel = cameras.project(poses.transform(jnp.asarray(points)[seen.point_index]))

@@ -16,7 +16,7 @@ PIXEL_STD_PX, GNSS_STD_M, CONTROL_STD_M = 0.3, (0.02, 0.02, 0.05), (0.01, 0.01, 
 def wrongly_weighed(outlier_fraction: float) -> Problem:
     """A block whose sigmas are stated as 1 px, 3 and 5 m, and 3 cm."""
     survey = jaxba.synthetic.uav_block(
-        20, seed=3, points_per_image=30.0, num_control=14, pixel_std_px=PIXEL_STD_PX, gnss_std_m=GNSS_STD_M,
+        20, seed=3, points_per_image=30.0, num_control=24, pixel_std_px=PIXEL_STD_PX, gnss_std_m=GNSS_STD_M,
         control_std_m=CONTROL_STD_M, outlier_fraction=outlier_fraction,
     )  # fmt: skip
     problem = survey.problem

@@ -46,10 +46,10 @@ def test_planted_sigmas_come_back(loss: AbstractLoss, outliers: float) -> None:
     }  # fmt: skip
     for component in found.components:
         assert component.is_known, component
-        # settled, and right within three of its own sigmas, of some 1% to 25%; 2% of gross errors add 5%
+        # settled, and right within three of its own sigmas, of some 1% to 25%; 2% of gross errors add 5 to 7%
         assert component.factor == pytest.approx(1.0, abs=0.1), component.name
         if component.name in planted:
-            allowed = max(3 / np.sqrt(2 * component.redundancy), 3 * outliers)
+            allowed = max(3 / np.sqrt(2 * component.redundancy), 4 * outliers)
             assert std[component.name] == pytest.approx(planted[component.name], rel=allowed), component
 
 

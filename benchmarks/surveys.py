@@ -4,8 +4,9 @@ Simulated blocks with 7000 observations a photo, as photos of 20 megapixels have
 many false ones again), and a view graph with the matches of every two photos of a track. Each survey goes through the
 three stages as `jaxba run` calls them, in a process of its own, and the peak of memory of each stage is printed.
 
-`--observations`: of a photo. `--max-memory`: what solving in tiles may hold. `--whole`: surveys that are adjusted in
-one piece as well; prints the largest distance of their cameras and points from those of the tiles.
+`--rounds`, `--ftol`: of the adjustment, `adjust.max_rounds` and `adjust.ftol`. `--observations`: of a photo.
+`--max-memory`: what solving in tiles may hold. `--whole`: surveys that are adjusted in one piece as well; prints the
+largest distance of their cameras and points from those of the tiles.
 """
 
 import argparse
@@ -159,7 +160,7 @@ def _gb(field: str) -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1e6
 
 
-def _one(num_photos: int, observations: int, max_memory: str, whole: bool, into: Path) -> None:
+def _one(num_photos: int, observations: int, max_memory: str, whole: bool, into: Path, params: adjust.Params) -> None:
     use_compilation_cache()
     photos, reference, features, view_graph = _given(num_photos, observations)
     before_gb = _gb("VmRSS")
@@ -176,7 +177,7 @@ def _one(num_photos: int, observations: int, max_memory: str, whole: bool, into:
         chunk_size = 500 if num_photos > 500 else None
         inputs = adjust.Inputs(**given, block=block, features=features, chunk_size=chunk_size)
         room = Room(bytes_of(max_memory, 1.0), into.parent)
-        found = adjust.run(inputs, adjust.Params(), room)
+        found = adjust.run(inputs, params, room)
     print(f"         {adjust.lines(found, _nothing_told(photos))[0]}", flush=True)
     np.savez(into, centers_m=found.block.centers_m, points_m=found.block.points_m, std_m=found.point_std_m)
 
@@ -191,11 +192,14 @@ def main() -> None:
     parser.add_argument("--whole", type=int, nargs="*", default=[250])
     parser.add_argument("--max-memory", default="5GB")
     parser.add_argument("--observations", type=int, default=7000)
+    parser.add_argument("--rounds", type=int, default=adjust.Params().max_rounds)
+    parser.add_argument("--ftol", type=float, default=adjust.Params().ftol)
     parser.add_argument("--one", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
         num_photos, observations, max_memory, whole, into = options.one
-        _one(int(num_photos), int(observations), max_memory, whole == "True", Path(into))
+        params = adjust.Params(max_rounds=options.rounds, ftol=options.ftol, xtol=min(options.ftol, 1e-8))
+        _one(int(num_photos), int(observations), max_memory, whole == "True", Path(into), params)
         return
     with tempfile.TemporaryDirectory() as folder:
         for num_photos in options.photos:
@@ -203,7 +207,8 @@ def main() -> None:
                 print(f"{num_photos} photos, in {'one piece' if whole else f'tiles, {options.max_memory}'}", flush=True)
                 sizes = str(num_photos), str(options.observations)
                 one = [*sizes, options.max_memory, str(whole), f"{folder}/{whole}.npz"]
-                subprocess.run([sys.executable, "-m", "benchmarks.surveys", "--one", *one], check=True)
+                of_rounds = ["--rounds", str(options.rounds), "--ftol", str(options.ftol)]
+                subprocess.run([sys.executable, "-m", "benchmarks.surveys", *of_rounds, "--one", *one], check=True)
             if num_photos in options.whole:
                 tiled, piece = (np.load(f"{folder}/{whole}.npz") for whole in (False, True))
                 apart = ", ".join(f"{name} {np.abs(tiled[name] - piece[name]).max():.1e}" for name in tiled)

@@ -28,11 +28,12 @@ COMPUTE_NOTHING = {
     "filelock",
     "jaxtyping",
     "lazy_loader",
+    "pandas",
     "pebble",
     "psutil",
     "threadpoolctl",
 }
-"""Packages that are imported and leave no mark on a result: they check, store and supervise."""
+"""Packages that are imported and leave no mark on a result: they check, store, supervise and lay out tables."""
 
 
 def versions_of(packages: frozenset[str]) -> dict[str, str]:

@@ -24,6 +24,7 @@ import jaxba
 from jaxba.engine._compile_cache import use_compilation_cache
 
 if TYPE_CHECKING:
+    from commands import Cli
     from small_survey import Survey
 
 # what tests share is imported by name, by them and by the workers that they start
@@ -85,6 +86,14 @@ def made(tmp_path_factory: pytest.TempPathFactory, photos: Path) -> "Survey":
     from small_survey import Survey, make_project, once, shared_folder
 
     return Survey(photos, once(shared_folder(tmp_path_factory), "run", make_project(photos)) / "project")
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> "Cli":
+    """Run a command; return its exit code, standard output and standard error."""
+    from commands import caller
+
+    return caller(capsys)
 
 
 @pytest.fixture

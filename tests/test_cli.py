@@ -1,41 +1,23 @@
-import dataclasses
 import inspect
 import json
 import os
 import subprocess
 import sys
 import typing
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from commands import Cli
 
 import jaxba
-from jaxba.cli import _gradcheck, _progress, _solve, main
-from jaxba.cli._info import components
+from jaxba.cli import _progress, _solve
 from jaxba.cli._options import LossName, SolveOptions
 from jaxba.cli._text import to_json
 from jaxba.engine._compile_cache import folder_name
 from jaxba.geometry import BAL, LOSSES
-
-Answer = tuple[int, str, str]
-Cli = Callable[..., Answer]
-
-
-@pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
-    """Run a command; return its exit code, standard output and standard error."""
-
-    def call(*arguments: object) -> Answer:
-        with pytest.raises(SystemExit) as stop:
-            main([str(argument) for argument in arguments])
-        return int(stop.value.code or 0), *capsys.readouterr()
-
-    return call
 
 
 @pytest.fixture(scope="module")
@@ -332,54 +314,6 @@ def test_bal_problem_is_written_as_bal_where_the_output_ends_in_txt(cli: Cli, tm
     assert sorted(os.listdir(tmp_path)) == ["problem.txt", "solved.txt"]
 
 
-def test_info_tells_what_a_problem_holds(cli: Cli, tile: Path, survey: jaxba.synthetic.Survey):
-    code, out, err = cli("info", tile, "--json")
-    assert (code, err) == (0, "")
-    found, problem = json.loads(out), survey.problem
-    lengths = {int(n): count for n, count in found["track_lengths"].items()}
-    assert sum(lengths.values()) == problem.num_points
-    assert sum(n * count for n, count in lengths.items()) == problem.num_observations
-    assert found["camera_model"] == "OPENCV"
-    assert found["components"] == [[str(i) for i in range(6)]]
-    assert found["free"]["intrinsics"]["k3"] == 0 and found["free"]["intrinsics"]["fx"] == 1
-    assert found["free_gauge"] == []
-    assert found["priors"] == [
-        {"name": "position", "rows": 6, "loss": "linear", "median_std": {"std_m": [0.03, 0.03, 0.06]}}
-    ]
-    total = float(jaxba.solve(problem, max_nfev=1).initial_cost)
-    assert sum(found["initial_costs"].values()) == pytest.approx(total, rel=1e-12)
-    code, out, _ = cli("info", tile)
-    assert code == 0
-    assert all(word in out for word in ("connected", "all images hang together", "k3", "position: 6 rows"))
-
-
-def test_images_that_share_no_point_are_told_apart_by_name():
-    problem = jaxba.synthetic.uav_block(6, points_per_image=40.0).problem
-    seen = problem.observations
-    first_two = seen.image_index < 2
-    sees_point = np.bincount(seen.point_index[first_two], minlength=problem.num_points) > 0
-    keep = first_two | ~sees_point[seen.point_index]
-    problem = dataclasses.replace(
-        problem, observations=jax.tree.map(lambda values: values[keep], seen), image_names=tuple("abcdef")
-    )
-    groups = components(problem)
-    assert sorted(name for group in groups for name in group) == list("abcdef")
-    assert ["a", "b"] in groups
-
-
-def test_synthetic_writes_the_same_survey_with_its_truth(cli: Cli, tmp_path: Path):
-    paths = tmp_path / "a.npz", tmp_path / "b.npz"
-    for path in paths:
-        code, out, _ = cli("synthetic", path, "--images", 5, "--seed", 4, "--outliers", 0.05)
-        assert code == 0 and "5 images" in out
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-    survey = jaxba.synthetic.uav_block(5, seed=4, outlier_fraction=0.05)
-    np.testing.assert_array_equal(jaxba.read_tile(paths[0]).points, survey.problem.points)
-    with np.load(paths[0]) as arrays:
-        np.testing.assert_array_equal(arrays["extra_truth_point_xyz_m"], survey.truth.points)
-        np.testing.assert_array_equal(arrays["extra_truth_is_outlier"], survey.truth.is_outlier)
-
-
 def test_json_has_null_for_what_is_not_finite():
     assert to_json({"a": np.array([1.0, np.nan]), "b": float("inf"), 3: (np.int32(2), True)}) == (
         '{"a": [1.0, null], "b": null, "3": [2, true]}'
@@ -407,37 +341,6 @@ def test_compilation_cache_is_in_the_users_folder_if_that_can_be(tmp_path: Path,
     before, after = run.stdout.split()
     assert after == expected
     assert before == ("None" if case != "jax's own variable" else expected)  # imports alone set nothing
-
-
-def test_gradcheck_prints_a_table_and_exits_by_its_tolerance(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    checked: list[jaxba.GradientCheck] = []
-
-    def once(*given: Any, tolerance: float, **options: Any) -> jaxba.GradientCheck:
-        if not checked:
-            checked.append(jaxba.check_gradients(*given, tolerance=tolerance, **options))
-        return dataclasses.replace(checked[0], tolerance=tolerance)  # another tolerance is not another computation
-
-    monkeypatch.setattr(_gradcheck, "check_gradients", once)
-    path = tmp_path / "tile.npz"
-    jaxba.write_tile(path, small_survey().problem)
-    code, out, _ = cli("gradcheck", path, "--fix", "intrinsics", "--loss", "cauchy", "--f-scale", 2)
-    assert code == 0 and "Derivatives of the optimum are within 1e-05 of central differences." in out
-    rows = {line.split("  ")[0] for line in out.splitlines()}
-    assert {"pixels", "pixel sigmas", "loss scale", "position xyz"} <= rows
-    code, out, _ = cli("gradcheck", path, "--fix", "intrinsics", "--loss", "cauchy", "--tolerance", 1e-30, "--json")
-    found = json.loads(out)
-    assert code == 1 and not found["passed"] and found["rows"][0]["name"] == "pixels"
-
-
-def test_gradcheck_refuses_a_block_without_gauge(cli: Cli, tmp_path: Path):
-    path = tmp_path / "tile.npz"
-    jaxba.write_tile(path, small_survey(gnss_std_m=None).problem)
-    code, _, err = cli("gradcheck", path)
-    assert code == 2 and "problem has no gauge" in err and "Add a position prior" in err
-
-
-def small_survey(**options: object) -> jaxba.synthetic.Survey:
-    return jaxba.synthetic.uav_block(4, seed=1, camera=jaxba.SimplePinhole(3600.0, 2736.0, 1824.0), **options)
 
 
 def test_a_solve_computes_on_the_device_that_it_is_told(cli: Cli, tile: Path):

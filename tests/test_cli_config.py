@@ -2,29 +2,21 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import Cli
 from PIL import Image
 
-from jaxba.cli import main
 from jaxba.engine import explained, from_toml
 from jaxba.pipeline import PIPELINE
 
 
 @pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable:
-    """Run a command in an empty folder; return its exit code, standard output and standard error."""
+def cli(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Cli:
+    """Run a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            main(arguments)
-        code = ended.value.code
-        return (code if isinstance(code, int) else 1, *capsys.readouterr())
-
-    return run
+    return cli
 
 
 def test_what_is_printed_is_a_file_that_can_be_used(cli, tmp_path: Path):

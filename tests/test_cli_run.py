@@ -6,34 +6,24 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import Cli
 from small_survey import FAST, NUM_PHOTOS, Survey
 
-from jaxba.cli import main
 from jaxba.cli._run import _result_rows
 from jaxba.cli._run_progress import LiveLine
 from jaxba.pipeline import NAMES, Event
 
-Answer = tuple[int, str, str]
-Cli = Callable[..., Answer]
 FLAGS = [part for change in FAST for part in ("--set", change)]
 
 
 @pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Cli:
-    """Run a command; return its exit code, standard output and standard error."""
+def cli(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> Cli:
+    """Run a command as the others do, which leaves the tests' own compile cache as it is."""
     monkeypatch.setattr("jaxba.cli._run.use_compilation_cache", lambda: None)
-
-    def call(*arguments: object) -> Answer:
-        with pytest.raises(SystemExit) as stop:
-            main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return int(stop.value.code or 0), out, err
-
-    return call
+    return cli
 
 
 def test_a_second_run_says_that_there_is_nothing_to_do(cli: Cli, made: Survey, tmp_path: Path):

@@ -6,15 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Cli
 
 import jaxba
-from jaxba.cli import main
-
-
-def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as stop:
-        main([str(argument) for argument in arguments])
-    return int(stop.value.code or 0), *capsys.readouterr()
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +24,9 @@ def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_statistics_are_those_of_the_written_solution(capsys: pytest.CaptureFixture[str], tile: Path) -> None:
+def test_statistics_are_those_of_the_written_solution(cli: Cli, tile: Path) -> None:
     out = tile.with_name("solved.npz")
-    code, text, _ = call(capsys, "solve", tile, "--statistics", "--json", "--out", out)
+    code, text, _ = cli("solve", tile, "--statistics", "--json", "--out", out)
     told = json.loads(text)["statistics"]
     found = jaxba.statistics(jaxba.read_tile(out))
     assert code == 0 and told["redundancy"] == found.covariance.redundancy
@@ -43,21 +37,21 @@ def test_statistics_are_those_of_the_written_solution(capsys: pytest.CaptureFixt
     assert np.array(told["correlation"]).shape == (len(told["unknowns"]),) * 2
     assert told["p_value"] == pytest.approx(found.p_value, rel=1e-6) and found.p_value < 0.01
 
-    code, text, _ = call(capsys, "solve", tile, "--statistics", "--out", out)
+    code, text, _ = cli("solve", tile, "--statistics", "--out", out)
     assert code == 0 and "largest: control of point 5" in text and "variance factor" in text
     assert "position horizontal: scatter by" in text and "k1 and k2 -0.9" in text
 
 
-def test_a_block_without_gauge_is_solved_all_the_same(capsys: pytest.CaptureFixture[str], tile: Path) -> None:
+def test_a_block_without_gauge_is_solved_all_the_same(cli: Cli, tile: Path) -> None:
     free = tile.with_name("free.npz")
     jaxba.write_tile(free, dataclasses.replace(jaxba.read_tile(tile), priors=()))
     out = tile.with_name("free.solved.npz")
-    code, text, _ = call(capsys, "solve", free, "--statistics", "--out", out)
+    code, text, _ = cli("solve", free, "--statistics", "--out", out)
     assert code == 0 and out.exists() and "There are none. Statistics: problem has no gauge" in text
-    code, text, _ = call(capsys, "solve", free, "--statistics", "--json", "--out", out)
+    code, text, _ = cli("solve", free, "--statistics", "--json", "--out", out)
     assert "no gauge" in json.loads(text)["statistics"]["why_not"]
 
 
-def test_statistics_of_a_batch_are_refused(capsys: pytest.CaptureFixture[str], tile: Path) -> None:
-    code, _, error = call(capsys, "solve", tile, tile.with_name("other.npz"), "--statistics")
+def test_statistics_of_a_batch_are_refused(cli: Cli, tile: Path) -> None:
+    code, _, error = cli("solve", tile, tile.with_name("other.npz"), "--statistics")
     assert code == 2 and "--statistics" in error and "one file" in error

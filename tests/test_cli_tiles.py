@@ -5,36 +5,27 @@ import errno
 import json
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 import pytest
+from commands import Cli
 from PIL import Image
 
 import jaxba
 from jaxba import Problem, Solution
 from jaxba._atomic import cannot_write
-from jaxba.cli import _solve_batch, main
+from jaxba.cli import _solve_batch
 from jaxba.io import read_tiles, write_tiles
-
-Answer = tuple[int, str, str]
-Cli = Callable[..., Answer]
 
 
 @pytest.fixture
-def cli(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cli:
-    """Run a command in an empty folder; return its exit code, standard output and standard error."""
+def cli(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cli:
+    """Run a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object) -> Answer:
-        with pytest.raises(SystemExit) as stop:
-            main([str(argument) for argument in arguments])
-        return int(stop.value.code or 0), *capsys.readouterr()
-
-    return call
+    return cli
 
 
 @pytest.fixture(scope="module")

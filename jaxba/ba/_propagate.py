@@ -23,7 +23,7 @@ from jaxba._errors import JaxbaError
 from jaxba.ba._problem import Problem
 from jaxba.ba._system import own_unknowns
 from jaxba.ba._unknowns import Step, Unknowns
-from jaxba.ba.checks import prepare, require_gauge
+from jaxba.ba.checks import Dropped, prepare, require_gauge
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._functionals import joint_covariance
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
@@ -33,11 +33,12 @@ from jaxba.geometry import AbstractLoss, Linear, check_loss
 class Propagated(NamedTuple):
     """Values of functions of the unknowns, and how well they are known.
 
-    - `covariance`: joint, a priori; as in `Covariance`.
+    - `covariance`: joint, a priori; as in `Covariance`. `dropped`: what took no part.
     """
 
     value: Float[np.ndarray, " m"]
     covariance: Float[np.ndarray, "m m"]
+    dropped: Dropped
 
     @property
     def std(self) -> Float[np.ndarray, " m"]:
@@ -69,20 +70,21 @@ def propagate(
     """
     loss = Linear() if loss is None else loss
     check_loss("propagate: loss", loss)
-    prepared = prepare(problem).problem
-    require_gauge(prepared, "Propagation")
-    unknowns = own_unknowns(prepared)
+    prepared = prepare(problem)
+    problem = prepared.problem
+    require_gauge(problem, "Propagation")
+    unknowns = own_unknowns(problem)
     with jax.enable_x64(True):
-        value, gradients = _gradients(function, prepared, unknowns)
+        value, gradients = _gradients(function, problem, unknowns)
     room: dict[str, Any] = {
         "max_memory": max_memory,
         "max_observations": max_observations,
         "folder": folder,
         "workers": workers,
     }
-    with opened("propagate", prepared, loss, columns=len(value), **room) as engine:
+    with opened("propagate", problem, loss, columns=len(value), **room) as engine:
         try:
-            return Propagated(value, joint_covariance(engine, unknowns, gradients))
+            return Propagated(value, joint_covariance(engine, unknowns, gradients), prepared.dropped)
         except NotPositive as error:
             raise JaxbaError(
                 "Propagation: the measurements do not determine all unknowns; jaxba.covariance(problem) names one."

@@ -15,13 +15,13 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import chdtrc
+from scipy.special import chdtrc, ndtri
 
 from jaxba.ba._leverage import Leverage
 
 SIGNIFICANCE, POWER = 0.001, 0.80
-NONCENTRALITY = 4.13
-"""Sigmas of a test that an error of the size `detectable` shifts: found with `POWER` in a test of `SIGNIFICANCE`."""
+NONCENTRALITY = float(ndtri(1 - SIGNIFICANCE / 2) + ndtri(POWER))
+"""Sigmas by which an error of the size `detectable` shifts a test of `SIGNIFICANCE`, so that it has this `POWER`."""
 _LEAST_REDUNDANCY = 1e-6  # of a component: below it rounding tells its test
 _ROUNDING = 1e-9  # of the largest leverage
 

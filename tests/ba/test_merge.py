@@ -296,6 +296,14 @@ def test_tiles_that_do_not_make_the_block_are_named(groups: list[range], message
         jaxba.merge_tiles(block, _cut(block, groups, is_apart=True))
 
 
+def test_tiles_with_an_offset_of_positions_each_are_refused() -> None:
+    block = _truth(gnss=True)
+    offset = np.zeros((1, 3)), np.array(True)
+    free = eqx.tree_at(lambda p: (p.position_offset, p.free.position_offset), block, offset)
+    with pytest.raises(JaxbaError, match=r"position offset is free, .* jaxba\.solve_tiled finds one"):
+        jaxba.merge_tiles(free, _cut(free, _GROUPS))
+
+
 def test_wrong_options_are_refused() -> None:
     block = _truth(gnss=True)
     with pytest.raises(JaxbaError, match="merge_tiles: max_nfev is 0"):

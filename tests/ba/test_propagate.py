@@ -1,5 +1,7 @@
 """Covariances of functions equal those of a dense inverse, whatever the functions are of."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -63,3 +65,13 @@ def test_function_without_a_number_and_without_a_derivative_is_refused():
         propagate(lambda p: jnp.zeros(0), problem)
     with pytest.raises(JaxbaError, match="not finite"):
         propagate(lambda p: jnp.linalg.norm(p.points[0] - p.points[0]), problem)
+
+
+def test_what_took_no_part_is_told():
+    problem = small_block()
+    seen = problem.observations
+    first = np.unique(seen.point_index, return_index=True)[1][20]
+    keep = (seen.point_index != 20) | (np.arange(len(seen.point_index)) == first)
+    once = dataclasses.replace(problem, observations=jax.tree.map(lambda values: values[keep], seen))
+    found = propagate(lambda p: p.points[jnp.array([20, 21]), 2], once)
+    assert found.dropped.points.tolist() == [20] and found.std[0] == 0 and found.std[1] > 0

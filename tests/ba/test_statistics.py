@@ -4,10 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.stats
 from dense_reference import Dense, loss_derivatives
 from test_covariance import CASES
 
 from jaxba.ba import Problem, RowStatistics, Statistics, Step, prior_statistics, statistics
+from jaxba.ba._reliability import NONCENTRALITY, POWER, SIGNIFICANCE
 from jaxba.geometry import Linear
 
 _SOLVED = 24  # rows of a group that are left out of the dense equations, which are solved anew
@@ -136,3 +138,10 @@ def test_statistics_of_priors_alone_are_the_same():
         assert one.name == other.name
         for name in ("redundancy", "test", "row_test", "detectable", "reach_m"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-9)
+
+
+def test_detectable_errors_are_those_of_the_level_and_power_of_the_test():
+    # shifted by Baarda's 4.13, a standard normal variable is beyond the limit of 0.1% in four of five cases
+    limit = scipy.stats.norm.isf(SIGNIFICANCE / 2)
+    assert scipy.stats.norm.sf(limit - NONCENTRALITY) == pytest.approx(POWER, abs=1e-6)
+    assert pytest.approx(4.13, abs=0.005) == NONCENTRALITY

@@ -9,12 +9,11 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import solve_triangular
 
 from jaxba.ba._compiler import call_compiled
 from jaxba.ba._unknowns import Step, Unknowns
-from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Engine
+from jaxba.ba.tiles._inverse import inverse_of_border
 from jaxba.ba.tiles._programs import Handed, hand_columns
 from jaxba.ba.tiles._tile_work import Up
 
@@ -40,14 +39,5 @@ def joint_covariance(engine: Engine, unknowns: Unknowns, gradients: Sequence[Ste
 
     top = engine.up(engine.each_tile(up), nothing).update[: border + count, : border + count]
     corner, across, left = top[:border, :border], top[border:, :border], top[border:, border:]
-    scale = np.diagonal(corner)
-    if not np.all(scale > 0):
-        raise NotPositive
-    scale = 1 / np.sqrt(scale)
-    try:
-        root = np.linalg.cholesky(corner * scale[:, None] * scale)  # numpy reads the lower triangle alone
-    except np.linalg.LinAlgError as error:
-        raise NotPositive from error
-    half = solve_triangular(root, (across * scale).T, lower=True)
     negative = np.tril(left)
-    return half.T @ half - negative - np.tril(negative, -1).T
+    return across @ inverse_of_border(corner) @ across.T - negative - np.tril(negative, -1).T

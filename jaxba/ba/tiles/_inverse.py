@@ -91,7 +91,7 @@ def marginals(
     """
     shape, tree, fronts = engine.shape, engine.tree, engine.fronts
     up = engine.up(engine.each_part("step_up", unknowns, np.array(damping), np.zeros(())), np.array(damping))
-    corner = _inverse(up.update[: shape.border, : shape.border])
+    corner = inverse_of_border(up.update[: shape.border, : shape.border])
     tail = np.zeros((fronts.tail * shape.block,) * 2)
     tail[: shape.border, : shape.border] = corner
     blocks = np.zeros((len(tree.rank), shape.block, shape.block))
@@ -184,23 +184,24 @@ def _of_tile(
     found = jax.tree.map(np.asarray, call_compiled(squares, system, own))
     of_points = system, model, inverse, np.array(damping)
     groups: list[Leverage] = []
-    takes = [np.arange(len(places)) for places in tile.prior_rows]  # what follows is padding
+    takes: list[np.ndarray] = []
     if rows == "all":
         joint: Joint = call_compiled(joint_marginals, *of_points)
         points = joint.points
         groups.append(call_compiled(pixel_leverage, system, own, inverse, joint))
         seen = np.flatnonzero(tile.plan.row_observation >= 0)
-        takes.insert(0, seen[np.argsort(tile.plan.row_observation[seen])])
+        takes.append(seen[np.argsort(tile.plan.row_observation[seen])])
     else:
         points = call_compiled(point_marginals, *of_points)
     if rows != "none":
         groups += call_compiled(prior_leverages, system, own, inverse, points)
-    of_rows = tuple(Leverage(*(np.asarray(part)[take] for part in of)) for of, take in zip(groups, takes, strict=False))
+        takes += [np.arange(len(places)) for places in tile.prior_rows]  # what follows is padding
+    of_rows = tuple(Leverage(*(np.asarray(part)[take] for part in of)) for of, take in zip(groups, takes, strict=True))
     count = len(tile.order)
     return _OfTile(number, images[:count], np.asarray(points)[: len(tile.points)], found, of_rows)
 
 
-def _inverse(corner: Float[np.ndarray, "border border"]) -> Float[np.ndarray, "border border"]:
+def inverse_of_border(corner: Float[np.ndarray, "border border"]) -> Float[np.ndarray, "border border"]:
     """Return the inverse of a symmetric matrix, of which the lower triangle is read, scaled to a diagonal of ones.
 
     Raises `NotPositive`.

@@ -117,8 +117,8 @@ def merge_tiles(
     The frame is the block's where its priors, or what is held fixed, place a tile; else that of the tile with most
     images. This is the quick answer: `solve_tiled` gives the exact one.
 
-    Raises `JaxbaError` where tiles belong to another block, an image is in no tile, values are not finite, and where
-    groups of tiles have too little in common.
+    Raises `JaxbaError` where tiles belong to another block, an image is in no tile, values are not finite, where groups
+    of tiles have too little in common, and where the block's position offset is free.
 
     >>> import jaxba
     >>> problem = jaxba.synthetic.uav_block(30).problem
@@ -135,6 +135,11 @@ def merge_tiles(
         raise JaxbaError("merge_tiles: a problem is traced, as inside jit, vmap and derivatives; merge outside of it.")
     max_nfev = require_stops("merge_tiles", max_nfev=max_nfev, ftol=ftol, xtol=xtol, gtol=gtol)
     _require_of_block(problem, tiles)
+    if problem.free.position_offset:
+        raise JaxbaError(
+            "merge_tiles: the position offset is free, and each tile has found one of its own; jaxba.solve_tiled finds "
+            "one for the whole block, or hold it fixed (free.position_offset) before tiles are cut."
+        )
 
     placed = place([frame_of_tile(tile) for tile in tiles], frame_of_block(problem))
     if placed.similarities is None:

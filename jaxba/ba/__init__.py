@@ -10,7 +10,7 @@ from jaxba.ba._projection import project_in_cameras
 from jaxba.ba._propagate import Propagated, propagate
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
 from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
-from jaxba.ba._reliability import RowStatistics
+from jaxba.ba._reliability import NONCENTRALITY, RowStatistics
 from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
@@ -36,6 +36,7 @@ from jaxba.ba.tiles._partition import BlockTile, Partition, partition
 from jaxba.ba.tiles._solve_tiled import solve_tiled
 
 __all__ = [
+    "NONCENTRALITY",
     "PRIORS",
     "AbstractPrior",
     "AspectPrior",

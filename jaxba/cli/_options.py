@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-NOT_CONVERGED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
+NOT_CONVERGED, UNUSABLE, BAD_INPUT, INTERRUPTED = 1, 1, 2, 130  # exit codes
 
 LossName = Literal["linear", "soft_l1", "huber", "cauchy", "arctan", "tukey", "geman_mcclure", "barron"]
 

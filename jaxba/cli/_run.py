@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.cli._options import BAD_INPUT, INTERRUPTED, WorkerOptions, fail, print_error
+from jaxba.cli._options import BAD_INPUT, INTERRUPTED, UNUSABLE, WorkerOptions, fail, print_error
 from jaxba.cli._run_progress import JsonLines, LiveLine, LogLines, Progress, StageLines, steps_told
 from jaxba.cli._settings import configured
 from jaxba.cli._text import first_of, labelled, many, to_json, wrapped
@@ -40,7 +40,7 @@ def run(
     quiet: bool,
     log_json: bool,
 ) -> int:
-    """Run the pipeline and say what came out; return the exit code."""
+    """Run the pipeline and say what came out; return the exit code: 1 where the result must not be used."""
     json_lines = JsonLines() if log_json else None
     show: Progress | None = json_lines
     if show is None and not (quiet or as_json):
@@ -94,7 +94,7 @@ def run(
         print(to_json(result.facts))
     elif not quiet:
         _print_summary(result, out)
-    return 0
+    return 0 if result.facts.get("adjust", {}).get("usable", True) else UNUSABLE
 
 
 def _clear(show: Progress | None) -> None:

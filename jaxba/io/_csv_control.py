@@ -35,6 +35,10 @@ CONTROL_COLUMNS = {
     "mark_rms_px": "RMS of the marks' reprojection errors, pixels",
     "over_sigma": "largest of the three differences between survey and all else, over its sigma",
     "suspect": "yes where it is larger than chance makes it",
+    "set_aside": "axes along which the survey contradicts all else and does not hold the block",
+    "without_east_m": "where all else places a control point, minus the survey, along true east, metres",
+    "without_north_m": "the same along true north",
+    "without_up_m": "the same of heights",
     "detectable_east_m": "smallest error of the survey that a test of 0.1% finds in four of five cases, metres",
     "detectable_north_m": "the same along true north; inf where nothing checks it",
     "detectable_up_m": "the same of heights",
@@ -42,6 +46,7 @@ CONTROL_COLUMNS = {
     "reason": "why cells of the row are empty",
 }
 _DECIMALS = 4
+_AXES = ("east", "north", "up")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,7 +55,7 @@ class ControlTable:
 
     - `surveyed`, `adjusted`: in the target CRS. `residual_m`: adjusted minus surveyed, local east, north, up.
     - `std_m`: of the adjusted point. `over_sigma`: largest difference over its sigma. `is_suspect`: beyond the limit.
-    - `detectable_m`, `reach_m`: see `ControlFit`.
+    - `is_set_aside`, `without_m`, `detectable_m`, `reach_m`: see `ControlFit`.
     - `reasons`: why something is not known of a point, else empty.
     """
 
@@ -64,6 +69,8 @@ class ControlTable:
     mark_rms_px: Float[np.ndarray, " points"]
     over_sigma: Float[np.ndarray, " points"]
     is_suspect: Bool[np.ndarray, " points"]
+    is_set_aside: Bool[np.ndarray, "points 3"]
+    without_m: Float[np.ndarray, "points 3"]
     detectable_m: Float[np.ndarray, "points 3"]
     reach_m: Float[np.ndarray, "points 3"]
     reasons: Sequence[str]
@@ -77,7 +84,7 @@ def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None
     >>> one, row = np.ones(1), np.array([[1.0, 2.0, np.nan]])
     >>> write_csv_control(path, ControlTable(names=["a"], is_check=one > 2, num_marks=one.astype(int), surveyed=row,
     ...     adjusted=row, residual_m=row, std_m=row, mark_rms_px=one, over_sigma=one, is_suspect=one > 2,
-    ...     detectable_m=row, reach_m=row, reasons=["no surveyed height"]))
+    ...     is_set_aside=row > 9, without_m=row, detectable_m=row, reach_m=row, reasons=["no surveyed height"]))
     >>> print(path.read_text().splitlines()[1][:68])
     a,control,1,1.0000,2.0000,,1.0000,2.0000,,0.0000,0.0000,,1.0000,2.0000
     """
@@ -101,6 +108,8 @@ def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None
             _cell(table.mark_rms_px[k], 2),
             _cell(table.over_sigma[k], 1),
             "yes" if table.is_suspect[k] else "no",
+            " ".join(axis for axis, aside in zip(_AXES, table.is_set_aside[k], strict=True) if aside),
+            *(_cell(value, _DECIMALS) for value in table.without_m[k]),
             *("inf" if value == np.inf else _cell(value, 3) for value in table.detectable_m[k]),
             _cell(np.max(table.reach_m[k], initial=-np.inf, where=np.isfinite(table.reach_m[k])), 3),
             _quoted(table.reasons[k], ',"'),

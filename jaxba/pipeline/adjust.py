@@ -14,6 +14,7 @@ from jaxba.engine._words import many
 from jaxba.report import Told, control_facts, grouped, sentences
 from jaxba.scene import (
     Block,
+    CommonOffset,
     Control,
     ControlFit,
     Features,
@@ -83,8 +84,9 @@ class Outputs:
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
     - `pruned`: edges left out, with their figures. `solver`: why the last solve stopped, as `Solution.result` names it.
-    - `gnss_offset_m`: added to measured positions, an axis, where control fixes the block; else 0.
+    - `common`: what positions have in common as an unknown of the last solve; None where it was none.
     - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
+    - `mark_std_px`: sigma of a mark that weighed them.
     - `affine`: 3 x 4, what coordinates take beside the block, of `control.method=affine`; else the identity.
     - `findings`: what a surveyor should know, in figures: ambiguities, contradictions, bounds reached.
     """
@@ -108,15 +110,21 @@ class Outputs:
     findings: tuple[Finding, ...] = ()
     pruned: tuple[PrunedEdge, ...] = ()
     solver: str = ""
-    gnss_offset_m: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    common: CommonOffset | None = None
     control: ControlFit = field(default_factory=ControlFit.nothing)
     mark_used: Bool[np.ndarray, " marks"] = field(default_factory=lambda: np.zeros(0, bool))
+    mark_std_px: float = 1.0
     affine: Float[np.ndarray, "3 4"] = field(default_factory=lambda: np.eye(3, 4))
 
     @property
     def gnss_minus_control_m(self) -> Float[np.ndarray, "3"]:
         """What all GNSS positions are off from control in common; NaN where it is not known."""
         return self.control.gnss_minus_control_m
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether no finding says that the result must not be used."""
+        return all(finding.kind != "do not use" for finding in self.findings)
 
 
 def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
@@ -144,7 +152,8 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         tiling,
     )
     sigmas = sfm.uncertainty(adjusted, reference)
-    controlled = sfm.apply_control(adjusted, sigmas, inputs.control, reference)
+    control = dataclasses.replace(inputs.control, mark_std_px=adjusted.mark_std_px)
+    controlled = sfm.apply_control(adjusted, sigmas, control, reference)
     block = controlled.block
     fit = sfm.gnss_fit(block, reference)
     sigmas = controlled.sigmas
@@ -159,7 +168,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
     )
     on_control, notes = described(
         "Findings on control",
-        lambda: sfm.control_findings(adjusted, inputs.control, controlled.fit, reference, photos),
+        lambda: sfm.control_findings(adjusted, control, controlled.fit, reference, photos),
         (),
     )
     found = (*on_control, *found, *(Finding.of("note", text=f"{note}.") for note in notes))
@@ -184,9 +193,10 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         findings=found,
         pruned=adjusted.pruned,
         solver=adjusted.solution.result,
-        gnss_offset_m=adjusted.gnss_offset_m,
+        common=None if adjusted.on_control is None else adjusted.on_control.standing.common,
         control=controlled.fit,
         mark_used=adjusted.mark_used,
+        mark_std_px=adjusted.mark_std_px,
         affine=controlled.affine,
     )
 
@@ -223,6 +233,7 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
         "cameras": {
             name: {"parameters": list(map(float, row)), "std": list(map(float, std))} for name, row, std in cameras
         },
+        "usable": outputs.is_usable,
         "findings": sentences(outputs.findings),
         "edges_left_out": [dataclasses.asdict(edge) for edge in outputs.pruned],
     }

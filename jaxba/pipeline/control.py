@@ -26,6 +26,7 @@ from jaxba.pipeline._marks import marks_in_photos
 from jaxba.report import Told, control_facts, control_lines, reference_facts
 from jaxba.scene import Control, LeftOut, LocalFrame, Photo, Reference
 
+_ASSUMED_MARK_STD_PX = 1.0
 _LEAST_FIT = {"helmert": 3, "affine": 4}  # control points that are marked twice
 
 
@@ -57,7 +58,9 @@ class Params(Parameters):
     check: str | None = parameter(None, help="names of points that are check points, such as gcp03, gcp07")
     std_h: float = parameter(0.02, low=0.001, high=10, help="sigma east and north of a point that states none, metres")
     std_v: float = parameter(0.03, low=0.001, high=20, help="sigma of its height, metres")
-    mark_std_px: float = parameter(1.0, low=0.05, high=20, help="sigma of a mark an axis, px")
+    mark_std_px: float | None = parameter(
+        None, low=0.05, high=20, help="sigma of a mark an axis, px; none: as the marks of each point scatter about it"
+    )
     mark_width_px: int | None = parameter(
         None, low=16, high=200_000, help="width of the photos in which marks were set; none: as the files, or EXIF"
     )
@@ -174,7 +177,8 @@ def _placed(inputs: Inputs, params: Params) -> Outputs:
         mark_point=found.point,
         mark_image=found.image,
         mark_xy_px=found.xy_px,
-        mark_std_px=params.mark_std_px,
+        mark_std_px=_ASSUMED_MARK_STD_PX if params.mark_std_px is None else params.mark_std_px,
+        mark_std_is_assumed=params.mark_std_px is None,
         method=params.method,
     )
     left = [*found.left_out, *_weak(control)]

@@ -175,6 +175,8 @@ def _write_control(inputs: Inputs, frame: LocalFrame) -> None:
         mark_rms_px=fit.mark_rms_px,
         over_sigma=fit.over_sigma,
         is_suspect=fit.is_suspect,
+        is_set_aside=fit.is_set_aside,
+        without_m=fit.without_m,
         detectable_m=fit.detectable_m,
         reach_m=fit.reach_m,
         reasons=[why_empty(*row) for row in zip(known, fit.num_marks, fit.adjusted_m, fit.std_m, strict=True)],
@@ -214,25 +216,24 @@ def _write_tile(inputs: Inputs) -> list[str]:
     """Write the block as a problem that `jaxba solve` takes; return what it leaves out."""
     from jaxba.ba import PRIORS
     from jaxba.io import write_tile
-    from jaxba.sfm import control_part, to_problem, with_offset
+    from jaxba.sfm import control_part, to_problem
 
     adjusted = inputs.adjusted
     block = adjusted.block
+    control = dataclasses.replace(inputs.control, mark_std_px=adjusted.mark_std_px)
     problem = to_problem(
         block,
-        with_offset(inputs.reference, adjusted.gnss_offset_m),
+        inputs.reference,
         inputs.photos,
         std_px=adjusted.std_px,
         position_scale=adjusted.position_scale,
-        control=control_part(block, inputs.control, adjusted.mark_used, adjusted.control.scale),
+        control=control_part(block, control, adjusted.mark_used, adjusted.control.used_std_m),
+        common=adjusted.common,
     )
     known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
     left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]
     write_tile(inputs.folder / "tile.npz", dataclasses.replace(problem, priors=known))
     notes = [f"tile.npz leaves out the priors that its format has no arrays for: {', '.join(left)}."] if left else []
-    if adjusted.gnss_offset_m.any():
-        moved = ", ".join(f"{value:+.3f}" for value in adjusted.gnss_offset_m)
-        notes.append(f"tile.npz holds the measured positions moved by {moved} m (east, north, up), onto control.")
     if adjusted.control.method in ("helmert", "affine"):
         notes.append(
             "tile.npz starts at the block as it was fitted to control afterwards, and holds none: solving it takes the "

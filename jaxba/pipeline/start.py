@@ -43,7 +43,7 @@ class Outputs:
 
 def run(inputs: Inputs, params: Params) -> Outputs:
     """Find start values for the largest component."""
-    from jaxba.sfm import initialise, place_by_control  # loads jax, which the table of stages must not
+    from jaxba.sfm import initialise, place_by_control, positions_hold  # loads jax, which the table of stages must not
 
     block = initialise(
         inputs.photos,
@@ -53,7 +53,8 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         camera_model=params.camera_model,
         min_angle_rad=float(np.deg2rad(params.min_angle)),
     )
-    return Outputs(block=place_by_control(block, inputs.control))
+    is_placed = block.is_georeferenced and positions_hold(block, inputs.reference)
+    return Outputs(block=place_by_control(block, inputs.control, is_placed=is_placed))
 
 
 def lines(outputs: Outputs, told: Told) -> list[str]:

@@ -10,6 +10,7 @@ from jaxba.engine._words import many
 from jaxba.scene import Control, ControlFit, LeftOut
 
 _SHOWN = 10
+_AXES = ("east", "north", "up")
 
 
 def control_lines(control: Control, notes: Sequence[str], left_out: Sequence[LeftOut]) -> list[str]:
@@ -33,7 +34,12 @@ def control_facts(control: Control, fit: ControlFit | None = None) -> dict[str, 
         use = np.isfinite(fit.residual_m).any(axis=1)
         for role, rms, mine in (("control", fit.control_rms_m, ~control.is_check), ("check", fit.check_rms_m, None)):
             facts[role] = _group(control, fit, rms, use & (control.is_check if mine is None else mine))
-        facts |= {"method": fit.method, "gnss_minus_control_m": fit.gnss_minus_control_m.tolist()}
+        facts |= {
+            "method": fit.method,
+            "gnss_minus_control_m": fit.gnss_minus_control_m.tolist(),
+            "gnss_minus_control_std_m": fit.gnss_minus_control_std_m.tolist(),
+            "scale": fit.scale.tolist(),
+        }
     facts["points"] = [_point(control, fit, k) for k in range(control.num_points)]
     return facts
 
@@ -97,6 +103,9 @@ def _point(control: Control, fit: ControlFit | None, k: int) -> dict[str, Any]:
         "std_m": fit.std_m[k].tolist(),
         "mark_rms_px": float(fit.mark_rms_px[k]),
         "over_sigma": float(fit.over_sigma[k]),
+        "set_aside": [axis for axis, aside in zip(_AXES, fit.is_set_aside[k], strict=True) if aside],
+        "without_m": fit.without_m[k].tolist(),
+        "without_std_m": fit.without_std_m[k].tolist(),
         "detectable_m": fit.detectable_m[k].tolist(),
         "reach_m": fit.reach_m[k].tolist(),
         "suspect": bool(fit.is_suspect[k]),

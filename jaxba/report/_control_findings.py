@@ -1,11 +1,10 @@
 """Findings on control and check points in words."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 _PARTS = {
-    "adjust": " It pulls the block no harder than a point that is off by 3 sigmas; make it a check point "
-    "(control.check) to leave it out.",
     "helmert": " It was left out of the fit where others remained.",
     "affine": " It was left out of the fit where others remained.",
 }
@@ -110,17 +109,80 @@ def _contradicts(
     )
 
 
-def _gnss_off(offset_m: Sequence[float], std_m: Sequence[float], is_compared: bool) -> str:
+def _gnss_off(
+    offset_m: Sequence[float], offset_std_m: Sequence[float], std_m: Sequence[float], is_compared: bool
+) -> str:
     how = "compared only" if is_compared else "the block follows control"
     known = [std if math.isfinite(offset) else math.inf for offset, std in zip(offset_m, std_m, strict=True)]
+    sigma = f" (sigma {along_axes(offset_std_m, '.2g')})" if any(map(math.isfinite, offset_std_m)) else ""
     return (
-        f"GNSS positions minus the block as control places it: {along_axes(offset_m, '+.2f')}, for all photos in "
-        f"common, with sigmas of {along_axes(known, '.2g')}; {how}. Decimetres are the antenna's offset; metres "
-        "and tens of metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the two."
+        f"GNSS positions minus the block as control places it: {along_axes(offset_m, '+.2f')}{sigma}, for all photos "
+        f"in common, where one position has sigmas of {along_axes(known, '.2g')}; {how}. Centimetres and decimetres "
+        "are the antenna's offset or a base beside its mark; metres and tens of metres two datums or height systems; "
+        "hundreds a wrong zone or swapped axes of one of the two."
     )
 
 
+def _set_aside(
+    name: str,
+    axes: Sequence[int],
+    off_m: Sequence[float],
+    std_m: Sequence[float],
+    over_sigma: float,
+    limit: float,
+    rivals: Sequence[str],
+) -> str:
+    where = "in height" if list(axes) == [2] else "across" if 2 not in axes else "across and in height"
+    return (
+        f"Control point {name} contradicts photos, positions and the other control points {where}: they place it "
+        f"{along_axes(off_m, '+.3f')} from where it was surveyed (sigma {along_axes(std_m, '.2g')}; {over_sigma:.1f} "
+        f"sigmas where {limit:g} are exceeded by chance in one of a thousand). It does not hold the block {where}. "
+        f"Check its coordinates, its name and its marks.{_or(rivals)}"
+    )
+
+
+def _exchanged(names: Sequence[str], apart_m: float, rivals: Sequence[str]) -> str:
+    first, second = names
+    return (
+        f"The labels of control points {first} and {second} are exchanged: each lies where the other was surveyed, "
+        f"{apart_m:.1f} m away. Neither holds the block. Exchange their coordinates in the list, or the names at their "
+        f"marks.{_or(rivals)}"
+    )
+
+
+def _or(rivals: Sequence[str]) -> str:
+    return f" {' or '.join(rivals)} would explain it as well: which it is cannot be told." if rivals else ""
+
+
+_REASONS: dict[str, Callable[..., str]] = {
+    "cannot tell": lambda names: (
+        f"the contradiction may lie with {' or '.join(names)}, and which cannot be told. Survey or mark one point more "
+        "near them"
+    ),
+    "most are wrong": lambda names: (
+        f"most of the control points contradict the block ({', '.join(names)}). Check the list's CRS, its heights, its "
+        "names and marks"
+    ),
+    "survey scatters": lambda times: (
+        f"control points scatter by {times:g} times their sigmas or more: that is no survey of them. Check the list's "
+        "CRS, its heights, its names and marks"
+    ),
+    "check points shifted": lambda shift_m: (
+        f"the block stands {along_axes(shift_m, '+.3f')} from where all check points say. Correct positions or control "
+        "by it, whichever is wrong"
+    ),
+}
+
+
+def _not_usable(reasons: Sequence[Mapping[str, Any]]) -> str:
+    texts = [_REASONS[one["reason"]](**{k: v for k, v in one.items() if k != "reason"}) for one in reasons]
+    return f"DO NOT USE this result: {'; '.join(texts)}; then run again."
+
+
 CONTROL_WORDS: dict[str, Callable[..., str]] = {
+    "do not use": _not_usable,
+    "control point set aside": _set_aside,
+    "control labels exchanged": _exchanged,
     "control without a place": _without_a_place,
     "control not marked twice": _not_marked_twice,
     "few control points": _few,

@@ -14,7 +14,7 @@ class Control:
       only a stand-in.
     - `is_check`: the point is compared with the result and takes no part in it.
     - `mark_point`: row of the point. `mark_image`: index of the image. `mark_xy_px`: on the file's pixel grid.
-    - `mark_std_px`: sigma of a mark an axis.
+    - `mark_std_px`: sigma of a mark an axis; `mark_std_is_assumed`: nobody states it, and marks may tell another.
     - `method`: how the points are used: `adjust`, `helmert`, `affine` or `none`.
     """
 
@@ -26,6 +26,7 @@ class Control:
     mark_image: Int[np.ndarray, " marks"]
     mark_xy_px: Float[np.ndarray, "marks 2"]
     mark_std_px: float = 1.0
+    mark_std_is_assumed: bool = False
     method: str = "adjust"
 
     @staticmethod
@@ -74,11 +75,15 @@ class ControlFit:
     - `detectable_m`: of a control point in the adjustment, the smallest error an axis that a test of 0.1% finds in four
       of five cases; infinite where nothing checks it. `reach_m`: by how much an error of that size moves the point.
     - `check_shift_m`, `check_shift_std_m`: what all check points are off in common, and its sigma; NaN of fewer than 3.
-    - `is_suspect`: over the limit of the blunder test.
+    - `without_m`, `without_std_m`: where all else that stands places a control point, minus the survey, and its sigma:
+      the residual of an adjustment without the point.
+    - `used_std_m`: the sigmas with which surveyed coordinates held the block, infinite where they did not.
+    - `is_suspect`: over the limit of the blunder test. `is_set_aside`: surveyed coordinates that the test took out.
     - `scale`: that sigmas of control were multiplied by, horizontal and vertical, since the points scatter by that.
     - `method`: by which control was used; `none` where it could not be.
-    - `control_rms_m`, `check_rms_m`: an axis, over all points that have a residual in it.
-    - `gnss_minus_control_m`: what all GNSS positions are off in common, where control fixes the block.
+    - `control_rms_m`, `check_rms_m`: an axis, over all points that have a residual in it and were not set aside.
+    - `gnss_minus_control_m`, `gnss_minus_control_std_m`: what all GNSS positions are off in common, where control fixes
+      the block, and its sigma; NaN of the latter after a fit.
     """
 
     adjusted_m: Float[np.ndarray, "points 3"]
@@ -89,13 +94,18 @@ class ControlFit:
     over_sigma: Float[np.ndarray, " points"]
     detectable_m: Float[np.ndarray, "points 3"]
     reach_m: Float[np.ndarray, "points 3"]
+    without_m: Float[np.ndarray, "points 3"]
+    without_std_m: Float[np.ndarray, "points 3"]
+    used_std_m: Float[np.ndarray, "points 3"]
     check_shift_m: Float[np.ndarray, "3"]
     check_shift_std_m: Float[np.ndarray, "3"]
     is_suspect: Bool[np.ndarray, " points"]
+    is_set_aside: Bool[np.ndarray, "points 3"]
     method: str
     control_rms_m: Float[np.ndarray, "3"]
     check_rms_m: Float[np.ndarray, "3"]
     gnss_minus_control_m: Float[np.ndarray, "3"]
+    gnss_minus_control_std_m: Float[np.ndarray, "3"]
     scale: Float[np.ndarray, "2"]
 
     @staticmethod
@@ -111,12 +121,17 @@ class ControlFit:
             over_sigma=np.full(num_points, np.nan),
             detectable_m=unknown,
             reach_m=unknown,
+            without_m=unknown,
+            without_std_m=unknown,
+            used_std_m=np.full((num_points, 3), np.inf),
             check_shift_m=np.full(3, np.nan),
             check_shift_std_m=np.full(3, np.nan),
             is_suspect=np.zeros(num_points, bool),
+            is_set_aside=np.zeros((num_points, 3), bool),
             method="none",
             control_rms_m=np.full(3, np.nan),
             check_rms_m=np.full(3, np.nan),
             gnss_minus_control_m=np.full(3, np.nan),
+            gnss_minus_control_std_m=np.full(3, np.nan),
             scale=np.ones(2),
         )

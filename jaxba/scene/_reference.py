@@ -55,3 +55,11 @@ class Reference:
     height_above_ground_m: Float[np.ndarray, " images"]
     review: tuple[LeftOut, ...] = ()
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class CommonOffset:
+    """What all measured positions have in common, measured minus true, as an unknown: its start value and sigma."""
+
+    start_m: Float[np.ndarray, "3"]
+    std_m: Float[np.ndarray, "3"]

@@ -1,7 +1,7 @@
 """Structure from motion: start values of poses and points, and the adjustment in rounds (arrays in, arrays out)."""
 
 from jaxba.sfm._adjust import Adjusted, adjust
-from jaxba.sfm._control import agreeing_marks, control_part, with_offset
+from jaxba.sfm._control import agreeing_marks, control_part
 from jaxba.sfm._control_findings import control_findings
 from jaxba.sfm._control_fit import Controlled, apply_affine, apply_control
 from jaxba.sfm._control_start import place_by_control
@@ -9,13 +9,13 @@ from jaxba.sfm._findings import GnssFit, findings, gnss_fit, height_above_ground
 from jaxba.sfm._initialise import initialise
 from jaxba.sfm._intrinsics import AtBound, free_parameters, intrinsics_at_bounds
 from jaxba.sfm._points import with_points
-from jaxba.sfm._problem import to_problem
+from jaxba.sfm._problem import positions_hold, to_problem
 from jaxba.sfm._rounds import Settings, Tiling
 from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [
     "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Tiling", "Uncertainty", "adjust", "agreeing_marks",
     "apply_affine", "apply_control", "control_findings", "control_part", "findings", "free_parameters", "gnss_fit",
-    "height_above_ground", "initialise", "intrinsics_at_bounds", "place_by_control", "to_problem", "uncertainty",
-    "with_offset", "with_points",
+    "height_above_ground", "initialise", "intrinsics_at_bounds", "place_by_control", "positions_hold", "to_problem",
+    "uncertainty", "with_points",
 ]  # fmt: skip

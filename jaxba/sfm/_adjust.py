@@ -25,12 +25,13 @@ from jaxba.ba import Problem, Solution
 from jaxba.geometry import AbstractLoss
 from jaxba.scene import Block, Control, Features, LeftOut, Photo, PrunedEdge, Reference, Tracks, ViewGraph
 from jaxba.sfm._complete import complete_tracks
-from jaxba.sfm._control import ControlPart, agreeing_marks
+from jaxba.sfm._control import ControlPart, Standing, agreeing_marks, mark_std
 from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, without_edges
 from jaxba.sfm._intrinsics import free_parameters
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
+from jaxba.sfm._onto_control import OnControl, onto_control
 from jaxba.sfm._points import apply_points, triangulate_tracks
-from jaxba.sfm._rounds import Rounds, Settings, Tiling, without_images
+from jaxba.sfm._rounds import Rounds, Settings, Solved, Tiling, without_images
 
 _log = logging.getLogger(__name__)
 
@@ -49,8 +50,10 @@ class Adjusted:
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions.
     - `num_judged`: observations that were judged by their error; those not in the block were rejected.
     - `medians_px`: of each round's observations after its solve. `converged`: the median no longer changed.
-    - `control`: the control points of the last solve, their start values at its solution. `mark_used`: of all marks,
-      those that agree with the others of their point. `gnss_offset_m`: added to measured positions, an axis.
+    - `control`: the control points of the last solve, their start values at its solution; `on_control`: what their
+      tests said. `mark_used`: of all marks, those that agree with the others of their point.
+    - `mark_std_px`: sigma of marks.
+    - `common_m`: what measured positions are off in common, as far as control tells it.
     - `max_memory`: that solving in tiles was allowed; None in one piece.
     - `pruned`: edges left out. `lost`: images that had too few observations left. `notes`: what else was decided.
     """
@@ -69,8 +72,10 @@ class Adjusted:
     lost: tuple[LeftOut, ...]
     notes: tuple[str, ...]
     mark_used: Bool[np.ndarray, " marks"]
-    gnss_offset_m: Float[np.ndarray, "3"]
+    mark_std_px: float
+    common_m: Float[np.ndarray, "3"]
     control: ControlPart | None = None
+    on_control: OnControl | None = None
     max_memory: float | str | None = None
 
     @property
@@ -178,6 +183,17 @@ def adjust(
                 f"No point is left after round {len(medians)} with a median error of {medians[-1]:.1f} px: the start "
                 "values are wrong. Check the focal length (--metadata.focal) and that all photos are of one flight."
             )
+    control = dataclasses.replace(control, mark_std_px=mark_std(block, control, mark_used))
+    mark_used = agreeing_marks(block, control)
+    rounds = dataclasses.replace(rounds, control=control)
+    max_memory = rounds.tiling.max_memory if shape is None else None
+
+    def stand(block: Block, standing: Standing) -> Solved:
+        solve = functools.partial(rounds.solve, free=every, mark_used=mark_used, shape=shape, number=len(medians))
+        return solve(block, std_px, max_nfev=settings.max_nfev, ftol=settings.ftol, standing=standing)
+
+    solved, on_control = onto_control(solved, std_px, reference, control, max_memory, stand)
+    block = solved.block
     return Adjusted(
         block=dataclasses.replace(block, unregistered=(*block.unregistered, *lost)),
         error_px=solved.error_px,
@@ -193,9 +209,11 @@ def adjust(
         lost=tuple(lost),
         notes=tuple(notes),
         mark_used=mark_used,
-        gnss_offset_m=solved.gnss_offset_m,
+        mark_std_px=control.mark_std_px,
+        common_m=solved.common_m,
         control=solved.control,
-        max_memory=rounds.tiling.max_memory if shape is None else None,
+        on_control=on_control,
+        max_memory=max_memory,
     )
 
 

@@ -1,41 +1,40 @@
 """Control points beside a block's own points: intersected from their marks, wrong marks told, put into the problem.
 
 A control point's marks are observations with a sigma of their own, whatever that of the tie points is, and the median
-and MAD of the tie points' errors reject none of them. Its surveyed coordinates are a prior with Huber's loss: a wrong
-point pulls no harder than one that is off by `CONTROL_LOSS` sigmas. Check points are intersected from their marks only.
-
-Where most points contradict the block by far more than their sigmas, the survey is worse than it claims: their sigmas
-are multiplied by `control_scale`, as those of GNSS positions are. It is asked after a solve with the sigmas as stated,
-so that a block that is merely bent has been bent right before.
+and MAD of the tie points' errors reject none of them. Its surveyed coordinates are a prior with Huber's loss: what a
+test has not found pulls no harder than one that is off by `CONTROL_LOSS` sigmas. Check points are intersected from
+their marks only. `Standing` says which coordinates hold the block: none at first (see `_onto_control.py`).
 
 A mark is wrong where the others of its point agree without it and miss it by more than `_WRONG` sigmas, and where no
-other mark can be blamed; two rays cannot tell which of them is wrong.
+other mark can be blamed; two rays cannot tell which of them is wrong. Where nobody states the sigma of marks, their
+scatter about the points that they place tells it (`mark_std`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba.geometry import Huber
-from jaxba.scene import Block, Control, Reference
+from jaxba.scene import Block, CommonOffset, Control, Reference
+from jaxba.sfm._measured import common_std
 from jaxba.sfm._rays import Rays, make_rays
 
 CONTROL_LOSS = Huber(3.0)
 LEAST_TO_PLACE = 3
-"""Control points that place a block, and that tell an offset of GNSS positions from it."""
-PLAIN_M = 1.0
-"""Sigma of a position beyond which it is that of a single receiver."""
+"""Control points that place a block."""
 _WRONG = 5.0  # sigmas of a mark
-_CONTRADICTS = 3.0  # sigmas: robust, of all control points; of what positions are off in common
+_MARK_STD_PX = 0.2, 3.0  # that marks are believed to have at least, and at most
+_ASSUMED = 4  # degrees of freedom that the sigma counts for that marks are taken to have before they tell
+_UNKNOWN_M = 1e4  # sigma of what positions have in common, where control tells it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControlPart:
     """Control points that a block's images show twice or more, ready to stand behind its own points in a problem.
 
-    - `rows`: of the points in `Control`. `start_m`: start values. `xyz_m`, `std_m`: as surveyed.
-    - `scale`: that `std_m` were multiplied by, horizontal and vertical.
+    - `rows`: of the points in `Control`. `start_m`: start values. `xyz_m`: as surveyed. `std_m`: sigmas that hold them,
+      infinite where a coordinate does not.
     - `observation_image`: row in the block's `image_index`. `observation_point`: row here.
     """
 
@@ -47,12 +46,23 @@ class ControlPart:
     observation_point: Int[np.ndarray, " observations"]
     observation_xy_px: Float[np.ndarray, "observations 2"]
     std_px: float
-    scale: Float[np.ndarray, "2"]
 
     @property
     def determined(self) -> Bool[np.ndarray, "3"]:
         """Which axes the points fix by themselves."""
         return np.isfinite(self.std_m).sum(axis=0) >= LEAST_TO_PLACE
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """What control and positions may say in a solve.
+
+    - `std_m`: of every point of `Control`, infinite where a coordinate does not hold the block.
+    - `common`: of the positions; None where there are none, or no control point takes part.
+    """
+
+    std_m: Float[np.ndarray, "points 3"]
+    common: CommonOffset | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,13 +152,13 @@ def agreeing_marks(block: Block, control: Control) -> Bool[np.ndarray, " marks"]
 
 
 def control_part(
-    block: Block, control: Control, use: Bool[np.ndarray, " marks"], scale: Float[np.ndarray, "2"] | None = None
+    block: Block, control: Control, use: Bool[np.ndarray, " marks"], std_m: Float[np.ndarray, "points 3"] | None = None
 ) -> ControlPart | None:
     """Return the control points that stand in an adjustment; None where there are none, or the block has no place.
 
-    `scale`: on their sigmas, horizontal and vertical.
+    `std_m`: sigmas that hold them, of every point of `control`; None as surveyed.
     """
-    scale = np.ones(2) if scale is None else scale
+    std_m = control.std_m if std_m is None else std_m
     if not block.is_georeferenced or control.method != "adjust":
         return None
     row = image_rows(block, control)
@@ -161,65 +171,53 @@ def control_part(
     number[rows] = np.arange(len(rows))
     keep = use & (number[control.mark_point] >= 0)
     return ControlPart(
-        rows=rows, start_m=found[rows], xyz_m=control.xyz_m[rows], std_m=control.std_m[rows] * scale[[0, 0, 1]],
-        scale=scale, observation_image=row[keep],
+        rows=rows, start_m=found[rows], xyz_m=control.xyz_m[rows], std_m=std_m[rows], observation_image=row[keep],
         observation_point=number[control.mark_point[keep]], observation_xy_px=control.mark_xy_px[keep],
         std_px=control.mark_std_px,
     )  # fmt: skip
 
 
-def control_scale(
-    block: Block, control: Control, use: Bool[np.ndarray, " marks"], *, is_free: bool
-) -> Float[np.ndarray, "2"]:
-    """Return what the sigmas of control points are multiplied by, horizontal and vertical, 1 but for contradictions.
+def mark_std(block: Block, control: Control, use: Bool[np.ndarray, " marks"]) -> float:
+    """Return the sigma of a mark, px: as stated, or from how marks scatter about the points that they place.
 
-    The median of the differences between points intersected from their marks and surveyed ones, over 0.6745 of their
-    sigmas, where it is over `_CONTRADICTS`. `is_free`: nothing but control places the block, which takes up seven of
-    the differences.
+    The sum of squares of a point's n marks has 2n - 3 degrees of freedom. The sigma that is assumed counts as much as
+    `_ASSUMED` degrees; the result stays within `_MARK_STD_PX`.
     """
+    if not control.mark_std_is_assumed:
+        return control.mark_std_px
     found = intersect(block, control, use)
-    mine = ~control.is_check & np.isfinite(found.point_m).all(axis=1)
-    known = mine[:, None] & np.isfinite(control.std_m)
-    with np.errstate(invalid="ignore"):
-        over = np.abs(found.point_m - control.xyz_m) / np.sqrt(control.std_m**2 + found.variance_m2)
-    scale = np.ones(2)
-    for k, (axes, taken) in enumerate(((slice(0, 2), 4), (slice(2, 3), 3))):
-        values = over[:, axes][known[:, axes]]
-        left = len(values) - (taken if is_free else 0)
-        if left < 2:
-            continue
-        ratio = float(np.median(values)) / 0.6745 * np.sqrt(len(values) / left)
-        scale[k] = ratio if ratio > _CONTRADICTS else 1.0
-    return scale
+    known = use & np.isfinite(found.error_px)
+    views = np.bincount(control.mark_point[known], minlength=control.num_points)
+    freedom = np.sum(np.maximum(2 * views[views >= 2] - 3, 0))
+    total = np.sum(found.error_px[known] ** 2) + _ASSUMED * control.mark_std_px**2
+    return float(np.clip(np.sqrt(total / (freedom + _ASSUMED)), *_MARK_STD_PX))
 
 
-def gnss_offset(
-    block: Block, reference: Reference, control: ControlPart | None, *, is_later: bool
-) -> Float[np.ndarray, "3"]:
-    """Return what measured positions are to be moved by, an axis: zero where control does not fix the block.
-
-    The median of block minus measured position. What all positions have in common (another datum, the antenna's offset)
-    contradicts control by itself, and control is right; their scatter is what they tell. Positions of a single receiver
-    (a sigma over `PLAIN_M`) always have such an offset. Better ones hold the height and with it the focal length, so
-    they are moved only where they contradict a block that was solved with them, by three sigmas: `is_later`. Over flat
-    ground, seen straight down, an offset of their heights looks like another focal length and does not show.
-    """
-    index = block.image_index[reference.is_used[block.image_index]]
-    if control is None or not len(index):
-        return np.zeros(3)
-    off_m, std_m = np.nan_to_num(median_offset(block, reference)), np.median(reference.std_m[index], axis=0)
-    free = (std_m > PLAIN_M) | (is_later & (np.abs(off_m) > _CONTRADICTS * std_m))
-    return np.where(control.determined & free, off_m, 0.0)
+def before_control(block: Block, reference: Reference, control: Control) -> Standing:
+    """Return how a block stands that control does not hold: its points are intersected, and nothing more."""
+    std_m = common_std(block, reference) if _takes_part(control) else None
+    common = None if std_m is None else CommonOffset(np.zeros(3), _held(std_m))
+    return Standing(np.full_like(control.std_m, np.inf), common)
 
 
-def median_offset(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:
-    """Return the median of block minus measured position, an axis; NaN where none is measured."""
-    index = block.image_index
-    known = reference.is_used[index, None] & np.isfinite(reference.std_m[index]) & np.isfinite(reference.xyz_m[index])
-    off = block.centers_m - reference.xyz_m[index]
-    return np.array([np.median(column[k]) if k.any() else np.nan for column, k in zip(off.T, known.T, strict=True)])
+def _takes_part(control: Control) -> bool:
+    return control.method == "adjust" and bool((~control.is_check).any())
 
 
-def with_offset(reference: Reference, offset_m: Float[np.ndarray, "3"]) -> Reference:
-    """Return the reference with all measured positions moved."""
-    return replace(reference, xyz_m=reference.xyz_m + offset_m)
+def after_tests(
+    control: Control,
+    wrong: Bool[np.ndarray, "points 3"],
+    scale: tuple[float, float],
+    common_std_m: Float[np.ndarray, "3"] | None,
+    shift_m: Float[np.ndarray, "3"],
+    is_shifted: Bool[np.ndarray, "3"],
+) -> Standing:
+    """Return how a block stands on what tests have left of control."""
+    std_m = np.where(wrong | control.is_check[:, None], np.inf, control.std_m * np.array(scale)[[0, 0, 1]])
+    if common_std_m is None:
+        return Standing(std_m, None)
+    return Standing(std_m, CommonOffset(shift_m, np.where(is_shifted, _UNKNOWN_M, _held(common_std_m))))
+
+
+def _held(std_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    return np.where(std_m > 0, std_m, 1e-3)  # where no position is measured along an axis it moves nothing

@@ -1,15 +1,18 @@
 """Findings on control: what a surveyor should know of the points, each a kind with its figures."""
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxba.scene import Block, Control, ControlFit, Finding, Photo, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._control import LEAST_TO_PLACE, image_rows
+from jaxba.sfm._control_explained import MOST_SCALE, Explained, Mistake
 from jaxba.sfm._control_fit import BLUNDER, LEAST_OF
 from jaxba.sfm._control_start import determines_tilt
-from jaxba.sfm._problem import is_collinear, used_positions
+from jaxba.sfm._measured import used_positions
+from jaxba.sfm._problem import is_collinear
 
-_OFFSET = 3.0  # sigmas of a position
+_OFFSET = 3.0  # sigmas of a position, after a fit
 _MARKS_OFF = 5.0  # sigmas of a mark, in the median
 
 
@@ -20,15 +23,18 @@ def control_findings(
     if not control.num_points:
         return ()
     block = adjusted.block
+    explained = _explained(adjusted, fit)
     return tuple(
         [
+            *_not_usable(control, fit, explained),
             *_unused(block, control, fit),
             *_too_few(block, control, fit, reference),
             *_wrong_marks(block, adjusted, control, fit, photos),
             *_scatter(control, fit),
             *_shifted(control, fit),
+            *_set_aside(control, fit, explained),
             *_suspects(control, fit),
-            *_offset(block, fit, reference),
+            *_offset(block, fit, reference, explained),
         ]
     )
 
@@ -97,11 +103,75 @@ def _scatter(control: Control, fit: ControlFit) -> list[Finding]:
     return [Finding.of("control scatters", count=count, axes=axes, scatter_m=scatter_m, stated_m=stated_m)]
 
 
+def _explained(adjusted: Adjusted, fit: ControlFit) -> Explained:
+    """Return what is wrong with control in the adjustment; nothing where it took no part."""
+    if adjusted.on_control is None or fit.method != "adjust":
+        return Explained(len(fit.is_suspect))
+    return adjusted.on_control.explained
+
+
+def _not_usable(control: Control, fit: ControlFit, explained: Explained) -> list[Finding]:
+    """The verdict that a result must not be used, with its reasons."""
+    reasons = []
+    for mistake in explained.mistakes:
+        if mistake.rivals:
+            names = [_culprit(control, one) for one in (mistake, *mistake.rivals)]
+            reasons.append({"reason": "cannot tell", "names": names})
+    used = ~control.is_check & np.isfinite(fit.adjusted_m).all(axis=1)
+    wrong = {mistake.points[0] for mistake in explained.mistakes if mistake.kind == "point"}
+    if 2 * len(wrong) > used.sum() > 1:
+        reasons.append({"reason": "most are wrong", "names": [control.names[k] for k in sorted(wrong)]})
+    if max(explained.scale) >= MOST_SCALE:
+        reasons.append({"reason": "survey scatters", "times": MOST_SCALE})
+    if _is_shifted(fit).any():
+        reasons.append({"reason": "check points shifted", "shift_m": fit.check_shift_m.tolist()})
+    return [Finding.of("do not use", reasons=reasons)] if reasons else []
+
+
+def _culprit(control: Control, mistake: Mistake) -> str:
+    if mistake.kind == "common":
+        return "all positions in common"
+    return " with ".join(control.names[k] for k in mistake.points)
+
+
+def _is_shifted(fit: ControlFit) -> Bool[np.ndarray, "3"]:
+    with np.errstate(invalid="ignore"):
+        return np.abs(fit.check_shift_m) > BLUNDER * fit.check_shift_std_m
+
+
+def _set_aside(control: Control, fit: ControlFit, explained: Explained) -> list[Finding]:
+    """Control that contradicts all else, as it was explained: points, and labels exchanged."""
+    found = []
+    for mistake in explained.mistakes:
+        rivals = [_culprit(control, rival) for rival in mistake.rivals]
+        if mistake.kind == "swapped":
+            names = [control.names[k] for k in mistake.points]
+            apart_m = float(np.linalg.norm(control.xyz_m[mistake.points[0]] - control.xyz_m[mistake.points[1]]))
+            found.append(Finding.of("control labels exchanged", names=names, apart_m=apart_m, rivals=rivals))
+    exchanged = {k for mistake in explained.mistakes if mistake.kind == "swapped" for k in mistake.points}
+    for k in np.flatnonzero(fit.is_set_aside.any(axis=1)):
+        if int(k) in exchanged:
+            continue
+        mine = [m for m in explained.mistakes if m.kind == "point" and m.points == (int(k),)]
+        axes = sorted({axis for m in mine for axis in m.axes})
+        found.append(
+            Finding.of(
+                "control point set aside",
+                name=control.names[k],
+                axes=axes,
+                off_m=[float(fit.without_m[k, axis]) if axis in axes else float("nan") for axis in range(3)],
+                std_m=[float(fit.without_std_m[k, axis]) if axis in axes else float("nan") for axis in range(3)],
+                over_sigma=float(fit.over_sigma[k]),
+                limit=BLUNDER,
+                rivals=sorted({_culprit(control, rival) for m in mine for rival in m.rivals}),
+            )
+        )
+    return found
+
+
 def _shifted(control: Control, fit: ControlFit) -> list[Finding]:
     """Check points that are all off alike: the block's place, and none of them, is wrong."""
-    with np.errstate(invalid="ignore"):
-        significant = np.abs(fit.check_shift_m) > BLUNDER * fit.check_shift_std_m
-    if not significant.any():
+    if not _is_shifted(fit).any():
         return []
     count = int(np.count_nonzero(control.is_check & np.isfinite(fit.adjusted_m).all(axis=1)))
     return [
@@ -126,18 +196,30 @@ def _suspects(control: Control, fit: ControlFit) -> list[Finding]:
             limit=BLUNDER,
             method=fit.method,
         )
-        for k in np.flatnonzero(fit.is_suspect)
+        for k in np.flatnonzero(fit.is_suspect & ~fit.is_set_aside.any(axis=1))
     ]
 
 
-def _offset(block: Block, fit: ControlFit, reference: Reference) -> list[Finding]:
+def _offset(block: Block, fit: ControlFit, reference: Reference, explained: Explained) -> list[Finding]:
+    """Positions that are off in common: as tests of the adjustment say, or after a fit by their sigmas."""
     offset = fit.gnss_minus_control_m
     index = block.image_index[used_positions(block, reference)]
     if not len(index) or not np.isfinite(offset).any():
         return []
     std = np.median(reference.std_m[index], axis=0)
-    known = np.isfinite(offset) & np.isfinite(std)
-    if not (np.abs(offset[known]) > _OFFSET * std[known]).any():
+    if fit.method == "adjust":
+        is_off = explained.is_shifted
+    else:
+        with np.errstate(invalid="ignore"):
+            is_off = np.abs(offset) > _OFFSET * std
+    if not is_off.any():
         return []
-    is_compared = fit.method == "none"
-    return [Finding.of("gnss off control", offset_m=offset.tolist(), std_m=std.tolist(), is_compared=is_compared)]
+    return [
+        Finding.of(
+            "gnss off control",
+            offset_m=offset.tolist(),
+            offset_std_m=fit.gnss_minus_control_std_m.tolist(),
+            std_m=std.tolist(),
+            is_compared=fit.method == "none",
+        )
+    ]

@@ -4,12 +4,12 @@
 put it; all others are intersected from their marks by the adjusted poses.
 
 **Blunder test.** A control point in the adjustment is compared with what marks, photos, positions and the other control
-points say of it (Baarda's test, see `jaxba.ba.RowStatistics`), a check point with where its marks place it. The
-difference over its sigma is over 3.29 by chance in one of a thousand. What all check points are off in common (a GNSS
-base, a datum) is told as such and blamed on none of them. In a fit, whose parameters a wrong point bends, it is the
-standardised residual `v / sigma_v` with `sigma_v^2` the diagonal of `S - A (A^T S^-1 A)^-1 A^T` (Baarda 1968), over
-their own scatter where that is larger; the point with the largest one is left out and the fit made anew, as long as
-enough are left.
+points say of it, and set aside where it contradicts them (`_control_explained.py`), a check point with where its marks
+place it. The difference over its sigma is over 3.29 by chance in one of a thousand. What all check points are off in
+common (a GNSS base, a datum) is told as such and blamed on none of them. In a fit, whose parameters a wrong point
+bends, it is the standardised residual `v / sigma_v` with `sigma_v^2` the diagonal of `S - A (A^T S^-1 A)^-1 A^T`
+(Baarda 1968), over their own scatter where that is larger; the point with the largest one is left out and the fit made
+anew, as long as enough are left.
 
 **Affine.** Twelve parameters near the similarity, each of their nine coefficients held to it with a sigma of 1%: flat
 control tells nothing of how heights are sheared, and that then stays as it is. A camera's pose cannot be sheared, so it
@@ -25,8 +25,10 @@ from scipy.spatial import KDTree
 from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control, ControlFit, Reference
 from jaxba.sfm._adjust import Adjusted
-from jaxba.sfm._control import LEAST_TO_PLACE, Intersected, intersect, median_offset
+from jaxba.sfm._control import LEAST_TO_PLACE, Intersected, intersect
+from jaxba.sfm._control_explained import Tested
 from jaxba.sfm._control_start import determines_tilt, fit_similarity, transformed
+from jaxba.sfm._measured import median_offset
 from jaxba.sfm._uncertainty import Uncertainty, own_variance
 
 BLUNDER = 3.29  # sigmas: one of a thousand by chance
@@ -62,7 +64,8 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
     block = adjusted.block
     if not control.num_points or not block.is_georeferenced:
         return Controlled(block, sigmas, IDENTITY, ControlFit.nothing(control.num_points))
-    scale = np.ones(2) if adjusted.control is None else adjusted.control.scale
+    on_control = adjusted.on_control
+    scale = np.ones(2) if on_control is None else np.array(on_control.explained.scale)
     control = replace(control, std_m=control.std_m * scale[[0, 0, 1]])
     held = np.any(np.isfinite(sigmas.point_std_m), axis=0)  # the axes that something measured holds the block along
     found = intersect(block, control, adjusted.mark_used)
@@ -92,13 +95,13 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
         is_shifted = np.abs(shift) > BLUNDER * shift_std
     in_common = np.where(control.is_check[:, None] & is_shifted, shift, 0.0)
     over = _largest(np.abs((off - in_common) / std))
-    detectable, reach = (np.full(off.shape, np.nan) for _ in range(2))
+    tests, set_aside = Tested.nothing(control.num_points), np.zeros(off.shape, bool)
+    used_std, offset_std = np.full(off.shape, np.inf), np.full(3, np.nan)
     if scores is not None:
         over = np.where(use, scores, over)
-    if sigmas.control is not None and adjusted.control is not None and method == "adjust":
-        rows = adjusted.control.rows
-        over[rows] = _largest(np.abs(sigmas.control.test))
-        detectable[rows], reach[rows] = sigmas.control.detectable, sigmas.control.reach_m
+    if on_control is not None and method == "adjust":
+        tests, set_aside, used_std = on_control.tested, on_control.explained.wrong, on_control.standing.std_m
+        over[use] = _largest(np.abs(tests.test[use]))
     if method == "adjust" and adjusted.control is not None:
         points = points.copy()
         points[adjusted.control.rows] = adjusted.control.start_m
@@ -108,8 +111,14 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
     residual = np.where(np.isfinite(control.std_m), points - control.xyz_m, np.nan)
     with np.errstate(invalid="ignore"):
         suspect = np.where(control.is_check | (method == "none"), over > _CHECK_OFF, over > BLUNDER) | left_out
+    if method == "adjust":
+        suspect = np.where(control.is_check, suspect, set_aside.any(axis=1))
     offset = np.full(3, np.nan)
-    if method != "none":
+    if on_control is not None and on_control.standing.common is not None and method == "adjust":
+        offset = np.where(np.isfinite(median_offset(block, reference)), adjusted.common_m, np.nan)
+        if sigmas.covariance is not None:
+            offset_std = np.sqrt(np.maximum(np.diagonal(sigmas.covariance.position_offset), 0.0))
+    elif method != "none":
         enough = np.isfinite(residual[use]).sum(axis=0) >= LEAST_TO_PLACE
         offset = np.where(enough, -median_offset(block, reference), np.nan)
     return Controlled(
@@ -123,15 +132,20 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
             num_marks=found.num_marks,
             mark_rms_px=_mark_rms(found, control, adjusted.mark_used),
             over_sigma=over,
-            detectable_m=detectable,
-            reach_m=reach,
+            detectable_m=tests.detectable_m,
+            reach_m=tests.reach_m,
+            without_m=tests.without_m,
+            without_std_m=tests.without_std_m,
+            used_std_m=used_std,
             check_shift_m=shift,
             check_shift_std_m=shift_std,
             is_suspect=suspect,
+            is_set_aside=set_aside,
             method=method,
-            control_rms_m=_rms(residual[~control.is_check]),
+            control_rms_m=_rms(np.where(set_aside, np.nan, residual)[~control.is_check]),
             check_rms_m=_rms(residual[control.is_check]),
             gnss_minus_control_m=offset,
+            gnss_minus_control_std_m=offset_std,
             scale=scale,
         ),
     )

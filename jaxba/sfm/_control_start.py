@@ -24,13 +24,14 @@ _LOSS = 2.0  # sigmas
 _HELD = 1e-6  # radians, or shares of the extent: sigma of what control does not tell
 
 
-def place_by_control(block: Block, control: Control) -> Block:
+def place_by_control(block: Block, control: Control, *, is_placed: bool) -> Block:
     """Return the block in the frame of its control points, where three of them or more can be used.
 
-    A block that positions have placed is moved as well, where control takes part in the adjustment.
+    `is_placed`: by positions, which leave it free in nothing. It stays where it is then, and control is tested against
+    it before it may move it.
     """
-    wanted = control.method != "none" and (control.method == "adjust" or not block.is_georeferenced)
-    if not wanted or not control.num_points:
+    is_fit = control.method != "adjust" and block.is_georeferenced
+    if is_placed or is_fit or control.method == "none" or not control.num_points:
         return block
     found = intersect(block, control, image_rows(block, control) >= 0)
     use = np.isfinite(found.point_m).all(axis=1) & ~control.is_check

@@ -12,7 +12,7 @@ from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Finding, Photo, Reference, described
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._intrinsics import intrinsics_at_bounds, natural_intrinsics
-from jaxba.sfm._problem import used_positions
+from jaxba.sfm._measured import used_positions
 from jaxba.sfm._uncertainty import Uncertainty
 
 _OUTLIER = 3.0  # sigmas

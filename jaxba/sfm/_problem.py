@@ -23,7 +23,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxba.ba import (
@@ -33,14 +33,16 @@ from jaxba.ba import (
     ControlPointPrior,
     IntrinsicsPrior,
     Observations,
+    PositionOffsetPrior,
     PositionPrior,
     Problem,
     Solution,
 )
 from jaxba.geometry import CAMERAS, Cauchy, GemanMcClure, Linear, Pose
-from jaxba.scene import Block, Photo, Reference
+from jaxba.scene import Block, CommonOffset, Photo, Reference
 from jaxba.sfm._control import CONTROL_LOSS, ControlPart
 from jaxba.sfm._intrinsics import NaturalIntrinsics, natural_intrinsics
+from jaxba.sfm._measured import LEAST_POSITIONS, used_positions
 
 POSITION_LOSS = GemanMcClure(4.0)
 _ASPECT_STD = 5e-4
@@ -62,6 +64,7 @@ def to_problem(
     let_go: float = 1.0,
     held: Sequence[str] = (),
     control: ControlPart | None = None,
+    common: CommonOffset | None = None,
 ) -> Problem:
     """Return the problem of a block with points, its observations and all priors.
 
@@ -70,7 +73,8 @@ def to_problem(
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
     - `let_go`: times the residual at which a position's loss lets it go.
     - `held`: names of the camera model's parameters that stay as they are.
-    - `control`: points and observations that follow the block's own.
+    - `control`: points and observations that follow the block's own. `common`: what positions are off in common, which
+      is an unknown then.
 
     >>> import numpy as np
     >>> from jaxba.sfm import free_parameters
@@ -108,6 +112,8 @@ def to_problem(
         std = np.concatenate([std, np.full(len(control.observation_image), control.std_px)])
         image = np.concatenate([image, control.observation_image])
         point = np.concatenate([point, number[control.observation_point]])
+    if common is not None:
+        priors.append(PositionOffsetPrior(xyz=np.zeros((1, 3)), std_m=common.std_m[None]))
     problem = Problem.build(
         Pose(block.quaternion, block.translation_m),
         model.from_parameters(inside),
@@ -119,6 +125,9 @@ def to_problem(
     )
     if block.camera_model == "OPENCV":
         problem = problem.fix(intrinsics=["k3"])
+    if common is not None:
+        free = dataclasses.replace(problem.free, position_offset=np.array(True))
+        problem = dataclasses.replace(problem, position_offset=common.start_m[None], free=free)
     return dataclasses.replace(problem, lower=natural.lower, upper=natural.upper)
 
 
@@ -134,11 +143,10 @@ def with_solution(block: Block, solution: Solution) -> Block:
     )
 
 
-def used_positions(block: Block, reference: Reference) -> Bool[np.ndarray, " images"]:
-    """Return which of the block's images have a position that is a prior."""
-    index = block.image_index
-    measured = np.isfinite(reference.xyz_m[index]) & np.isfinite(reference.std_m[index])
-    return reference.is_used[index] & measured.any(axis=1) & block.is_georeferenced
+def positions_hold(block: Block, reference: Reference) -> bool:
+    """Whether measured positions leave a block free in nothing: place, scale, or rotation."""
+    used = used_positions(block, reference)
+    return int(used.sum()) >= LEAST_POSITIONS and _fix_attitude(reference, block.image_index[used])
 
 
 def is_collinear(positions_m: Float[np.ndarray, "n 3"]) -> bool:
@@ -150,7 +158,7 @@ def is_collinear(positions_m: Float[np.ndarray, "n 3"]) -> bool:
 
 
 def _fix_attitude(reference: Reference, index: np.ndarray) -> bool:
-    """Whether positions fix a block's rotation: they lie on no line, and their heights are measured."""
+    """Whether positions of images fix a block's rotation: they lie on no line, and their heights are measured."""
     full = index[np.isfinite(reference.std_m[index] + reference.xyz_m[index]).all(axis=1)]
     return not is_collinear(reference.xyz_m[full])
 
@@ -172,7 +180,7 @@ def _position_priors(
     used = used_positions(anchor, reference)
     extent = np.linalg.norm(anchor.centers_m - np.median(anchor.centers_m, axis=0), axis=1)
     weak = _ANCHOR * max(float(np.sqrt(np.mean(extent**2))), 1e-6)
-    if used.sum() < 3:
+    if used.sum() < LEAST_POSITIONS:
         xyz, std = anchor.centers_m, np.full((anchor.num_images, 3), weak)
         if anchor.is_georeferenced:
             measured = reference.xyz_m[anchor.image_index[used]]

@@ -21,17 +21,10 @@ from jaxtyping import Bool, Float
 from jaxba.ba import HistoryStep, PlanShape, Problem, Solution, make_plan, reprojection_errors, solve, solve_tiled
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
 from jaxba.scene import Block, Control, Photo, Reference, Tracks
-from jaxba.sfm._control import (
-    LEAST_TO_PLACE,
-    PLAIN_M,
-    ControlPart,
-    control_part,
-    control_scale,
-    gnss_offset,
-    with_offset,
-)
+from jaxba.sfm._control import ControlPart, Standing, before_control, control_part
+from jaxba.sfm._measured import PLAIN_M, used_positions
 from jaxba.sfm._points import track_rows
-from jaxba.sfm._problem import to_problem, used_positions, with_solution
+from jaxba.sfm._problem import to_problem, with_solution
 
 _log = logging.getLogger(__name__)
 
@@ -91,7 +84,7 @@ class Solved:
     loss: AbstractLoss
     solution: Solution
     position_scale: Float[np.ndarray, "3"]
-    gnss_offset_m: Float[np.ndarray, "3"]
+    common_m: Float[np.ndarray, "3"]
     control: ControlPart | None
 
 
@@ -117,33 +110,31 @@ class Rounds:
         max_nfev: int,
         ftol: float,
         number: int,
+        standing: Standing | None = None,
     ) -> Solved:
         """Solve a block; `free` are the camera's parameters that may change, `shape` is of `shape`.
 
         - `mark_used`: of all marks of control. `number`: of the round, from 1.
+        - `standing`: of control and positions; None where control does not hold the block.
         """
-        is_later = number > 1
         settings = self.settings
         model = LOSSES[settings.loss]
         loss = Linear() if model is Linear else model(f_scale=settings.f_scale / std_px)  # type: ignore[call-arg]
         scale, let_go = position_scale(block, self.reference), 1.0
-        scale_of_control = None
-        if is_later and self.control.num_points:
-            is_free = int(used_positions(block, self.reference).sum()) < LEAST_TO_PLACE
-            scale_of_control = control_scale(block, self.control, mark_used, is_free=is_free)
-        control = control_part(block, self.control, mark_used, scale_of_control)
-        if control is None and number <= _TRUSTING_ROUNDS and max_nfev < settings.max_nfev:
+        if standing is None:
+            standing = before_control(block, self.reference, self.control)
+        control = control_part(block, self.control, mark_used, standing.std_m)
+        common = None if control is None else standing.common
+        if number <= _TRUSTING_ROUNDS and max_nfev < settings.max_nfev:
             # how positions scatter about a block whose camera is not yet right tells nothing of them
             let_go = float(np.max(scale / np.minimum(scale, 1.0)))
             scale = np.minimum(scale, 1.0)
-        offset_m = gnss_offset(block, self.reference, control, is_later=is_later)
-        reference = with_offset(self.reference, offset_m)
         held = [name for name in CAMERAS[block.camera_model].parameter_names() if name not in free]
 
         def problem_of(block: Block, control: ControlPart | None) -> Problem:
             return to_problem(
                 block,
-                reference,
+                self.reference,
                 self.photos,
                 anchor=self.anchor,
                 std_px=std_px,
@@ -151,6 +142,7 @@ class Rounds:
                 let_go=let_go,
                 held=held,
                 control=control,
+                common=common,
             )
 
         problem = problem_of(block, control)
@@ -185,7 +177,8 @@ class Rounds:
             problem = problem_of(block, control)
             error_px = reprojection_errors(problem)
         error_px = error_px[: block.num_observations]
-        return Solved(block, error_px, problem, loss, solution, scale, offset_m, control)
+        common_m = np.zeros(3) if common is None else np.asarray(solution.position_offset)[0]
+        return Solved(block, error_px, problem, loss, solution, scale, common_m, control)
 
     def shape(self, block: Block, tracks: Tracks) -> PlanShape | None:
         """Return the shape of the block with every observation that may ever join it: all rounds share it.
@@ -205,7 +198,8 @@ class Rounds:
             observation_xy_px=tracks.xy_px[row],
         )
         control = control_part(block, self.control, np.ones(len(self.control.mark_point), bool))
-        problem = to_problem(full, self.reference, self.photos, anchor=self.anchor, control=control)
+        common = None if control is None else before_control(block, self.reference, self.control).common
+        problem = to_problem(full, self.reference, self.photos, anchor=self.anchor, control=control, common=common)
         return make_plan(problem, spare=_SPARE).shape
 
 

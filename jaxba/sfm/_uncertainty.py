@@ -1,17 +1,10 @@
 """Sigmas of an adjusted block, from the covariance of its last solve, or why there are none.
 
-The sigmas of observations are enlarged to how far errors really scatter (`spread`), so the covariance is not scaled by
-the variance factor once more; a point's own errors count in its sigma (`with_own_errors`).
+The sigmas of observations are enlarged to how far errors really scatter (`_spread.py`), so the covariance is not scaled
+by the variance factor once more; a point's own errors count in its sigma (`with_own_errors`).
 
-Positions are known to the mean of all GNSS positions; an offset that these have in common, metres for a single
-receiver, is not in their sigmas, nor here.
-
-**All together.** The sigma that weighs an observation is that of the median. Errors of feature points have longer tails
-than a normal distribution, and all of them bear on the result. An estimate that solves `sum psi(e) = 0` has the
-variance `E psi^2 / (E psi')^2` an observation (Huber 1964): for SIFT points in simulated photos 1.8 times what the
-median says. Errors cut off by a limit look narrower than they are, so it is taken as 1 at least. What cutting itself
-costs is not in it: with normal errors, poses known and 5% or 10% cut, points scatter by 1.10 or 1.17 times their
-variance, all of it in tracks that lost an observation.
+Without control, positions are known to the mean of all GNSS positions; an offset that these have in common, metres for
+a single receiver, is not in their sigmas, nor here. With control it is an unknown, and its sigma is in all others.
 
 **Each point.** A blurred or slanted feature is measured worse in all its images: squared errors within a track have a
 correlation of 0.3 to 0.4. The sums of squared errors of tracks tell how variances are distributed (scaled inverse
@@ -25,24 +18,21 @@ So a point of two images hardly speaks for itself, one of ten does.
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import digamma, polygamma
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import Covariance, Problem, RowStatistics, covariance, prior_statistics
-from jaxba.geometry import AbstractLoss
+from jaxba.ba import Covariance, covariance
 from jaxba.scene import Block, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._cores import on_all_cores
-from jaxba.sfm._points import pieces, redundancy_root
-from jaxba.sfm._problem import used_positions
+from jaxba.sfm._measured import used_positions
+from jaxba.sfm._points import pieces
 from jaxba.sfm._rays import make_rays
+from jaxba.sfm._spread import spread, weighed
 
 _PIECE = 100_000  # observations worked on at a time by a core
-_LEAST_REDUNDANCY = 30  # to tell how errors are spread
 _LEAST_TRACKS, _LEAST_FREEDOM = 100, 3  # to tell how variances are distributed
 _FREEDOM = np.geomspace(3.0, 1000.0, 400)  # of that distribution; at the last, all tracks are alike
 
@@ -53,7 +43,6 @@ class Uncertainty:
 
     - `position_std_m`, `point_std_m`: world. `intrinsics_std`: in the parameters' units, 0 for what is fixed.
     - `variance_factor`: of the residuals, by the sigmas that weighed observations, tails aside; NaN likewise.
-    - `control`: redundancy, tests and reliability of the surveyed coordinates, a row for each of `Adjusted.control`.
     """
 
     position_std_m: Float[np.ndarray, "images 3"]
@@ -62,22 +51,16 @@ class Uncertainty:
     variance_factor: float
     why_not: str | None = None
     covariance: Covariance | None = None
-    control: RowStatistics | None = None
 
 
 def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured."""
     block = adjusted.block
     position, point = np.full((block.num_images, 3), np.nan), np.full((block.num_points, 3), np.nan)
-    times = spread(adjusted)
-    observations = adjusted.problem.observations
-    own = adjusted.block.num_observations
-    std_px = np.concatenate([observations.std_px[:own] * times, observations.std_px[own:]])  # those of marks stand
-    observations = dataclasses.replace(observations, std_px=std_px)
-    problem = dataclasses.replace(adjusted.problem, observations=observations)
-    loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
+    times = spread(block, adjusted.error_px, adjusted.std_px, adjusted.loss)
+    problem, loss = weighed(adjusted.problem, adjusted.loss, times, block.num_observations)
     try:
-        found, priors = _covariance_and_priors(problem, loss, adjusted)
+        found = covariance(problem, loss=loss, max_memory=adjusted.max_memory)
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")
@@ -97,41 +80,7 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
             "no scale to give them in. Add GNSS positions or ground control."
         )
     factor = found.variance_factor * times**2  # positions' part of the cost is small
-    control = next((rows for rows in priors if rows.name == "control"), None)
-    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found, control)
-
-
-def _covariance_and_priors(
-    problem: Problem, loss: AbstractLoss, adjusted: Adjusted
-) -> tuple[Covariance, tuple[RowStatistics, ...]]:
-    """Return the covariances; with control the statistics of the priors too."""
-    if adjusted.control is None:
-        return covariance(problem, loss=loss, max_memory=adjusted.max_memory), ()
-    return prior_statistics(problem, loss=loss, max_memory=adjusted.max_memory)
-
-
-def spread(adjusted: Adjusted) -> float:
-    """Return how many times the sigma that weighed an observation accounts for the scatter of what was estimated.
-
-    With psi(e) = w(|e|) e over all observations, in sigmas, E over both coordinates:
-
-        spread^2 = E psi^2 E w / (E psi')^2,   E psi' = E (w + |e|^2 dw/d|e|^2)
-
-    `E psi^2` is over the redundancy; psi' is taken at errors as in long tracks. It is 1 at least.
-    """
-    block, error = adjusted.block, adjusted.error_px / adjusted.std_px
-    redundancy = 2 * block.num_observations - 3 * block.num_points - 6 * block.num_images
-    if redundancy < _LEAST_REDUNDANCY:
-        return 1.0
-    views = np.bincount(block.observation_point, minlength=block.num_points)
-    comparable = error * redundancy_root(views)[block.observation_point]
-    with jax.enable_x64(True):
-        _, weight, change = (np.asarray(part) for part in adjusted.loss.derivatives(jnp.asarray(comparable**2)))
-    slope = np.mean(weight + comparable**2 * change)
-    if slope <= 0:  # a loss that turns back, with most errors beyond its turn
-        return 1.0
-    squared = np.sum((weight * error) ** 2) / redundancy
-    return float(max(np.sqrt(squared * np.mean(weight)) / slope, 1.0))
+    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found)
 
 
 def with_own_errors(

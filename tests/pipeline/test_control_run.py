@@ -71,7 +71,10 @@ def test_tile_holds_the_control_points_with_their_marks(run: Run, survey: Survey
     block = run.done.adjust.block
     assert problem.num_points == block.num_points + 5
     marks = np.asarray(problem.observations.point_index) >= block.num_points
-    assert marks.sum() >= 10 and set(np.asarray(problem.observations.std_px)[marks]) == {1.0}
+    std_px = run.done.adjust.mark_std_px
+    assert 0.2 < std_px < 0.5  # they were set with 0.3
+    assert marks.sum() >= 10 and set(np.asarray(problem.observations.std_px)[marks]) == {std_px}
+    np.testing.assert_allclose(problem.position_offset[0], run.done.adjust.control.gnss_minus_control_m, atol=0.01)
     adjusted = run.done.adjust.control.adjusted_m[~run.done.control.control.is_check]
     # the tile starts at the marks' intersection, the adjusted points are held by the survey too
     np.testing.assert_allclose(np.asarray(problem.points)[block.num_points :], adjusted, atol=0.1)

@@ -246,18 +246,63 @@ CASES = [
     ),
     (
         Finding.of(
-            "control point contradicts",
+            "control point set aside",
             name="g1",
-            is_check=False,
-            residual_m=[0.5, -0.1, NAN],
-            over_sigma=9.0,
+            axes=[2],
+            off_m=[NAN, NAN, -0.314],
+            std_m=[NAN, NAN, 0.051],
+            over_sigma=6.3,
             limit=3.29,
-            method="adjust",
+            rivals=[],
         ),
-        "Control point g1 contradicts the block: adjusted minus surveyed east +0.500, north -0.100 m, "
-        "9.0 sigmas where 3.29 are exceeded by chance in one of a thousand. Check its coordinates, its name and "
-        "its marks. It pulls the block no harder than a point that is off by 3 sigmas; make it a check point "
-        "(control.check) to leave it out.",
+        "Control point g1 contradicts photos, positions and the other control points in height: they place it "
+        "up -0.314 m from where it was surveyed (sigma up 0.051 m; 6.3 sigmas where 3.29 are exceeded by chance in one "
+        "of a thousand). It does not hold the block in height. Check its coordinates, its name and its marks.",
+    ),
+    (
+        Finding.of(
+            "control point set aside",
+            name="g1",
+            axes=[0, 1],
+            off_m=[0.3, 0.0, NAN],
+            std_m=[0.02, 0.03, NAN],
+            over_sigma=13.0,
+            limit=3.29,
+            rivals=["g2", "all positions in common"],
+        ),
+        "Control point g1 contradicts photos, positions and the other control points across: they place it "
+        "east +0.300, north +0.000 m from where it was surveyed (sigma east 0.02, north 0.03 m; 13.0 sigmas where 3.29 "
+        "are exceeded by chance in one of a thousand). It does not hold the block across. Check its coordinates, its "
+        "name and its marks. g2 or all positions in common would explain it as well: which it is cannot be told.",
+    ),
+    (
+        Finding.of("control labels exchanged", names=["g1", "g4"], apart_m=72.84, rivals=[]),
+        "The labels of control points g1 and g4 are exchanged: each lies where the other was surveyed, 72.8 m away. "
+        "Neither holds the block. Exchange their coordinates in the list, or the names at their marks.",
+    ),
+    (
+        Finding.of(
+            "do not use",
+            reasons=[
+                {"reason": "cannot tell", "names": ["g1", "all positions in common"]},
+                {"reason": "check points shifted", "shift_m": [0.0, 0.0, 0.4]},
+            ],
+        ),
+        "DO NOT USE this result: the contradiction may lie with g1 or all positions in common, and which cannot be "
+        "told. Survey or mark one point more near them; the block stands east +0.000, north +0.000, up +0.400 m from "
+        "where all check points say. Correct positions or control by it, whichever is wrong; then run again.",
+    ),
+    (
+        Finding.of(
+            "do not use",
+            reasons=[
+                {"reason": "most are wrong", "names": ["g1", "g2"]},
+                {"reason": "survey scatters", "times": 10.0},
+            ],
+        ),
+        "DO NOT USE this result: most of the control points contradict the block (g1, g2). Check the list's CRS, its "
+        "heights, its names and marks; control points scatter by 10 times their sigmas or more: that is no survey of "
+        "them. Check the list's CRS, its heights, its names and marks; then run again.",
     ),
     (
         Finding.of(
@@ -316,18 +361,30 @@ CASES = [
         "and its marks.",
     ),
     (
-        Finding.of("gnss off control", offset_m=[1.5, -2.0, NAN], std_m=[0.03, 0.03, 0.06], is_compared=False),
-        "GNSS positions minus the block as control places it: east +1.50, north -2.00 m, for all "
-        "photos in common, with sigmas of east 0.03, north 0.03 m; the block follows control. Decimetres are the "
-        "antenna's offset; metres and tens of metres two datums or height systems; hundreds a wrong zone or "
-        "swapped axes of one of the two.",
+        Finding.of(
+            "gnss off control",
+            offset_m=[1.5, -2.0, NAN],
+            offset_std_m=[0.02, 0.02, NAN],
+            std_m=[0.03, 0.03, 0.06],
+            is_compared=False,
+        ),
+        "GNSS positions minus the block as control places it: east +1.50, north -2.00 m (sigma east 0.02, north 0.02 "
+        "m), for all photos in common, where one position has sigmas of east 0.03, north 0.03 m; the block follows "
+        "control. Centimetres and decimetres are the antenna's offset or a base beside its mark; metres and tens of "
+        "metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the two.",
     ),
     (
-        Finding.of("gnss off control", offset_m=[1.5, -2.0, 31.0], std_m=[3.0, 3.0, INF], is_compared=True),
-        "GNSS positions minus the block as control places it: east +1.50, north -2.00, up +31.00 m, for all "
-        "photos in common, with sigmas of east 3, north 3 m; compared only. Decimetres are the antenna's offset; metres"
-        " and tens of metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the "
-        "two.",
+        Finding.of(
+            "gnss off control",
+            offset_m=[1.5, -2.0, 31.0],
+            offset_std_m=[NAN, NAN, NAN],
+            std_m=[3.0, 3.0, INF],
+            is_compared=True,
+        ),
+        "GNSS positions minus the block as control places it: east +1.50, north -2.00, up +31.00 m, for all photos in "
+        "common, where one position has sigmas of east 3, north 3 m; compared only. Centimetres and decimetres are the "
+        "antenna's offset or a base beside its mark; metres and tens of metres two datums or height systems; hundreds "
+        "a wrong zone or swapped axes of one of the two.",
     ),
 ]
 

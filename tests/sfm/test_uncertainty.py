@@ -9,7 +9,8 @@ from simulated import Simulated, simulate, true_block
 from jaxba.scene import Block
 from jaxba.sfm import Settings, adjust
 from jaxba.sfm._points import apply_points, triangulate_tracks
-from jaxba.sfm._uncertainty import own_factors, own_variance, spread, with_own_errors
+from jaxba.sfm._spread import spread
+from jaxba.sfm._uncertainty import own_factors, own_variance, with_own_errors
 
 STD_PX = 0.5
 
@@ -71,5 +72,6 @@ def test_long_tails_widen_the_sigmas_and_normal_errors_do_not() -> None:
     found = []
     for survey in (normal, tailed):
         given = (survey.block, survey.tracks, survey.view_graph, survey.reference, survey.photos)
-        found.append(spread(adjust(*given, Settings())))
+        made = adjust(*given, Settings())
+        found.append(spread(made.block, made.error_px, made.std_px, made.loss))
     assert found[0] < 1.05 and 1.15 < found[1] < 2.0

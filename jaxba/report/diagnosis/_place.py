@@ -253,13 +253,13 @@ def _is_sound(case: Recorded) -> bool:
 
 def _against_photos(case: Recorded, figures: dict[str, object]) -> list[str]:
     """Return what the adjusted block says against the positions."""
-    from jaxba.sfm import gnss_fit, with_offset  # loads jax
+    from jaxba.sfm import gnss_fit  # loads jax
 
     done, texts = case.done, []
-    block, reference = done.adjust.block, with_offset(done.control.reference, done.adjust.gnss_offset_m)
+    block, reference = done.adjust.block, done.control.reference
     fit = gnss_fit(block, reference)
     bad: Bool[np.ndarray, " images"] = fit.is_outlier
-    most = float(np.nanmax(np.abs(fit.residual_m[bad]))) if bad.any() else 0.0
+    most = float(np.nanmax(np.abs(fit.residual_m[bad] - fit.middle_m))) if bad.any() else 0.0
     if bad.sum() > _OUTLIERS * (fit.num + bad.sum()) and most > _METRE:
         names = [done.photos[i].name for i in block.image_index[bad]]
         figures |= {"outliers": names, "largest_m": most}

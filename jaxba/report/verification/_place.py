@@ -47,7 +47,7 @@ def place_checks(
 ) -> Iterator[Check]:
     """Yield the checks of CRS and place; skipped where the block has none.
 
-    `offset_m`: what control moved the measured positions by.
+    `offset_m`: what the measured positions are off from control in common.
     """
     missing = [name for name in ("control", "metadata") if read_record(project.stage(name)) is None]
     if missing:

@@ -86,11 +86,10 @@ def exported_findings(folder: Path, pipeline: Pipeline) -> tuple[Finding, ...]:
 
 
 def _moved_m(adjusted: Any | None) -> np.ndarray:
-    """Return what control moved the measured positions by: in the adjustment, or the block beside them afterwards."""
+    """Return what the measured positions are off from the block, where control holds that."""
     if adjusted is None:
         return np.zeros(3)
-    away_m = np.nan_to_num(adjusted.gnss_minus_control_m)
-    return adjusted.gnss_offset_m if adjusted.gnss_offset_m.any() else away_m
+    return np.nan_to_num(adjusted.gnss_minus_control_m)
 
 
 def _files(folder: Path, written: Any) -> Check:

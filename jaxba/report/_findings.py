@@ -97,7 +97,7 @@ def _positions_contradict(
     figures = [along_axes(row, "+.1f") for row in residual_m]
     verb, count = ("contradicts", "counts") if len(names) == 1 else ("contradict", "count")
     return (
-        f"{many(len(names), 'measured position')} of {measured:,} {verb} the photos by more than {sigmas:g} robust "
+        f"{many(len(names), 'measured position')} of {measured:,} {verb} the photos by more than {sigmas:.1f} robust "
         f"sigmas and hardly {count} (adjusted minus measured): {_named(names, figures)}."
     )
 

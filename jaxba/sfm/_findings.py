@@ -6,16 +6,17 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import gammaincinv
+from scipy.special import gammaincinv, stdtrit
 
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Finding, Photo, Reference, described
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._intrinsics import intrinsics_at_bounds, natural_intrinsics
-from jaxba.sfm._measured import used_positions
+from jaxba.sfm._measured import PLAIN_M, used_positions
 from jaxba.sfm._uncertainty import Uncertainty
 
-_OUTLIER = 3.0  # sigmas
+_OUTLIER = 3.29  # sigmas: one of a thousand by chance
+_FREEDOM = 0.45  # times n: of Student's t that the residuals of n values over their robust sigma follow (simulated)
 _SCATTER, _SIGNIFICANCE = 1.5, 1e-3
 _WEAK_OBSERVATIONS = 20
 _FOCAL_OFF = 0.05  # from the photos' focal length
@@ -32,8 +33,9 @@ class GnssFit:
     """Adjusted minus measured positions.
 
     - `residual_m`: of every registered image, NaN where nothing was measured or not used.
-    - `is_outlier`: beyond three robust sigmas. `rms_m`: an axis over the `num` others; None without any.
+    - `is_outlier`: beyond `limit` robust sigmas. `rms_m`: an axis over the `num` others; None without any.
     - `scale_m`: robust sigma of the residuals about their median `middle_m`, an axis, metres.
+    - `limit`: of an outlier, in robust sigmas.
     """
 
     residual_m: Float[np.ndarray, "images 3"]
@@ -42,13 +44,15 @@ class GnssFit:
     num: int
     scale_m: Float[np.ndarray, "3"]
     middle_m: Float[np.ndarray, "3"]
+    limit: float
 
 
 def gnss_fit(block: Block, reference: Reference) -> GnssFit:
     """Return how well the block fits its measured positions.
 
-    An outlier's residual is over three sigmas in some axis, where sigma is the larger of the position's own and the
-    residuals' robust one. Both are counted from the median: what all have in common is no error of each.
+    An outlier's residual is over its limit in some axis: 3.29 of the position's own sigmas, and as many robust ones
+    of the residuals as Student's t exceeds by chance in one of a thousand. Both are counted from the median: what all
+    have in common is no error of each.
     """
     used = used_positions(block, reference)
     index = block.image_index
@@ -61,7 +65,8 @@ def gnss_fit(block: Block, reference: Reference) -> GnssFit:
     )
     own = np.where(known, reference.std_m[index], np.nan)
     # a plain receiver's sigma of metres is mostly a common offset: what scatters within a flight is judged by itself
-    limit = _OUTLIER * np.where(own > 1.0, np.maximum(scale, own / 3), np.maximum(scale, own))
+    robust = float(max(-stdtrit(max(_FREEDOM * np.count_nonzero(used), 1.0), 5e-4), _OUTLIER))
+    limit = np.maximum(robust * scale, np.where(own > PLAIN_M, own, _OUTLIER * own))
     with np.errstate(invalid="ignore"):
         outlier = used & np.any(np.abs(residual - middle) > limit, axis=1)
     inlier = used & ~outlier
@@ -71,7 +76,7 @@ def gnss_fit(block: Block, reference: Reference) -> GnssFit:
             squared = [np.nanmean(c**2) if np.isfinite(c).any() else np.nan for c in residual[inlier].T]
         east, north, up = (float(np.sqrt(s)) for s in squared)
         rms = (east, north, up)
-    return GnssFit(residual, outlier, rms, int(inlier.sum()), scale, middle)
+    return GnssFit(residual, outlier, rms, int(inlier.sum()), scale, middle, robust)
 
 
 def findings(
@@ -169,7 +174,7 @@ def _outliers(block: Block, fit: GnssFit, photos: Sequence[Photo]) -> list[Findi
             names=_names(block, photos, bad),
             residual_m=fit.residual_m[bad].tolist(),
             measured=fit.num + len(bad),
-            sigmas=_OUTLIER,
+            sigmas=fit.limit,
         )
     ]
 

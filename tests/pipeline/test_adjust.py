@@ -4,12 +4,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from simulated import Simulated, simulate
 
 from jaxba import sfm
 from jaxba.pipeline import adjust
 from jaxba.pipeline.adjust import Inputs, Outputs, Params
 from jaxba.report import Told
+from jaxba.simulation.staged import Simulated, simulate
 
 
 @pytest.fixture(scope="module")

@@ -78,14 +78,14 @@ CASES = [
     ),
     (
         Finding.of("positions contradict", names=["a"], residual_m=[[-2.0, 0.04, NAN]], measured=12, sigmas=3.0),
-        "1 measured position of 12 contradicts the photos by more than 3 robust sigmas and hardly counts (adjusted "
+        "1 measured position of 12 contradicts the photos by more than 3.0 robust sigmas and hardly counts (adjusted "
         "minus measured): a (east -2.0, north +0.0 m).",
     ),
     (
         Finding.of(
             "positions contradict", names=["a", "b"], residual_m=[[-2.0, 0.04, 9.0], [5.0] * 3], measured=12, sigmas=3.0
         ),
-        "2 measured positions of 12 contradict the photos by more than 3 robust sigmas and hardly count (adjusted "
+        "2 measured positions of 12 contradict the photos by more than 3.0 robust sigmas and hardly count (adjusted "
         "minus measured): a (east -2.0, north +0.0, up +9.0 m), b (east +5.0, north +5.0, up +5.0 m).",
     ),
     (

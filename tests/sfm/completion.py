@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from simulated import Simulated
 
 from jaxba.scene import Features, Tracks
+from jaxba.simulation.staged import Simulated
 
 
 def features_of(scene: Simulated, seed: int) -> dict[int, Features]:

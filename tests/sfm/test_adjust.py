@@ -11,13 +11,13 @@ import pytest
 from completion import features_of, reduced
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from simulated import Simulated, simulate, view_graph_of
 
 from jaxba import JaxbaError, solve, solve_tiled
 from jaxba.ba import HistoryStep, _descend, make_plan
 from jaxba.scene import Block, Tracks
 from jaxba.sfm import Adjusted, Settings, Tiling, Uncertainty, _rounds, adjust, uncertainty
 from jaxba.sfm._edges import match_rows, without_edges
+from jaxba.simulation.staged import Simulated, simulate, view_graph_of
 
 WITHOUT = [3, 7]  # images without a position
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from completion import features_of, reduced
-from simulated import Simulated, simulate, true_block
 
 from jaxba.scene import Tracks
 from jaxba.sfm import with_points
 from jaxba.sfm._complete import complete_tracks
+from jaxba.simulation.staged import Simulated, simulate, true_block
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import Simulated, simulate, true_block
 
 from jaxba.ba import make_plan
 from jaxba.geometry import Similarity
@@ -27,6 +26,7 @@ from jaxba.sfm import (
 from jaxba.sfm._control import agreeing_marks, control_part, intersect, mark_std
 from jaxba.sfm._control_fit import Controlled, apply_affine, fit_affine
 from jaxba.sfm._control_start import transformed
+from jaxba.simulation.staged import Simulated, simulate, true_block
 
 OFFSET_M = np.array([12.0, -7.0, 31.0])
 SETTINGS = Settings(max_rounds=3)

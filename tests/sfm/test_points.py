@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from simulated import Simulated, simulate, true_block
 
 from jaxba import JaxbaError
 from jaxba.geometry import OpenCV
@@ -17,6 +16,7 @@ from jaxba.sfm import _edges, _points, _uncertainty, with_points
 from jaxba.sfm._edges import edge_medians_px, match_rows
 from jaxba.sfm._points import Triangulated, apply_points, triangulate_tracks
 from jaxba.sfm._uncertainty import own_variance
+from jaxba.simulation.staged import Simulated, simulate, true_block
 
 ANGLE = 0.02
 

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from simulated import Simulated, simulate
 
 from jaxba.ba import free_gauge
 from jaxba.scene import Block
 from jaxba.sfm import free_parameters, to_problem, with_points
 from jaxba.sfm._problem import is_collinear
+from jaxba.simulation.staged import Simulated, simulate
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 

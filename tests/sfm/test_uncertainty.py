@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated import Simulated, simulate, true_block
 
 from jaxba.scene import Block
 from jaxba.sfm import Settings, adjust
 from jaxba.sfm._points import apply_points, triangulate_tracks
 from jaxba.sfm._spread import spread
 from jaxba.sfm._uncertainty import own_factors, own_variance, with_own_errors
+from jaxba.simulation.staged import Simulated, simulate, true_block
 
 STD_PX = 0.5
 

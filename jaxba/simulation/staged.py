@@ -1,15 +1,18 @@
-"""Simulated surveys as the stages see them: photos, reference, view graph, tracks and a block with start values."""
+"""Simulated surveys as the stages see them: photos, reference, view graph, tracks, a block with start values, control.
+
+Without photos and features, a survey and its adjustment take a second, so that hundreds can be drawn.
+"""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxba.scene import Block, LocalFrame, Photo, Reference, Tracks, ViewGraph
-from jaxba.simulation import Survey, uav_block
+from jaxba.scene import Block, Control, LocalFrame, Photo, Reference, Tracks, ViewGraph
+from jaxba.simulation.synthetic import Survey, uav_block
 
 FRAME = LocalFrame(
     latitude_deg=50.0, longitude_deg=14.0, height_m=300.0, crs="EPSG:32633", epsg=32633,
@@ -104,6 +107,64 @@ def true_block(simulated: Simulated) -> Block:
         translation_m=np.asarray(truth.poses.translation),
         camera_parameters=parameters,
     )
+
+
+def measured_anew(
+    simulated: Simulated, rng: np.random.Generator, gnss_std_m: tuple[float, float, float], std_px: float = 0.5
+) -> Simulated:
+    """Return the same flight with errors of pixels and positions drawn anew: as many of each, in the same photos."""
+    truth = simulated.survey.truth
+    centers = np.asarray(truth.poses.center)
+    std_m = np.tile(gnss_std_m, (len(centers), 1))
+    reference = replace(
+        simulated.reference, frame=FRAME, xyz_m=centers + std_m * rng.normal(size=centers.shape), std_m=std_m
+    )
+    tracks = replace(simulated.tracks, xy_px=truth.xy_px + std_px * rng.normal(size=truth.xy_px.shape))
+    return replace(simulated, reference=reference, tracks=tracks)
+
+
+def spread_control(
+    simulated: Simulated,
+    num_control: int,
+    num_check: int,
+    rng: np.random.Generator,
+    *,
+    std_m: tuple[float, float, float] = (0.02, 0.02, 0.03),
+    mark_std_px: float = 0.3,
+) -> Control:
+    """Return points of the block as control and check points by turns, far from each other, in five photos or more.
+
+    - `std_m`: of the survey. `mark_std_px`: of the marks, which nobody states.
+    """
+    truth, seen = simulated.survey.truth, simulated.survey.problem.observations
+    point, image = np.asarray(seen.point_index), np.asarray(seen.image_index)
+    chosen = _far_apart(truth.points, np.flatnonzero(np.bincount(point, minlength=len(truth.points)) >= 5),
+                        num_control + num_check)  # fmt: skip
+    is_check = np.zeros(len(chosen), bool)
+    is_check[np.round(np.linspace(0, len(chosen) - 1, num_check)).astype(int)] = True
+    rows = np.concatenate([np.flatnonzero(point == p) for p in chosen])
+    sigmas = np.tile(std_m, (len(chosen), 1))
+    numbers = {int(p): k for k, p in enumerate(chosen)}
+    return Control(
+        names=tuple(f"{'check' if check else 'gcp'}{k:02d}" for k, check in enumerate(is_check)),
+        xyz_m=truth.points[chosen] + sigmas * rng.normal(size=sigmas.shape),
+        std_m=sigmas,
+        is_check=is_check,
+        mark_point=np.array([numbers[int(p)] for p in point[rows]], dtype=np.int64),
+        mark_image=image[rows].astype(np.int64),
+        mark_xy_px=truth.xy_px[rows] + mark_std_px * rng.normal(size=(len(rows), 2)),
+        mark_std_is_assumed=True,
+    )
+
+
+def _far_apart(
+    points_m: Float[np.ndarray, "points 3"], rows: Int[np.ndarray, " rows"], count: int
+) -> Int[np.ndarray, " count"]:
+    chosen = [int(rows[0])]
+    while len(chosen) < count:  # the farthest from those before
+        away = np.linalg.norm(points_m[rows, None] - points_m[chosen], axis=2).min(axis=1)
+        chosen.append(int(rows[np.argmax(away)]))
+    return np.array(chosen)
 
 
 def view_graph_of(tracks: Tracks) -> ViewGraph:

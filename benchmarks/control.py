@@ -107,7 +107,7 @@ class Draws:
     """Surveys of one flight, with errors drawn anew."""
 
     def __init__(self) -> None:
-        self.flight = simulate(12, seed=4, points_per_image=60.0)
+        self.flight = simulate(12, seed=4, points_per_image=300.0)
 
     def __call__(self, kind: str, num_control: int, seed: int) -> Given:
         rng = np.random.default_rng(seed)

@@ -132,13 +132,13 @@ def spread_control(
     std_m: tuple[float, float, float] = (0.02, 0.02, 0.03),
     mark_std_px: float = 0.3,
 ) -> Control:
-    """Return points of the block as control and check points by turns, far from each other, in five photos or more.
+    """Return points of the block as control and check points by turns, far from each other, in six photos or more.
 
     - `std_m`: of the survey. `mark_std_px`: of the marks, which nobody states.
     """
     truth, seen = simulated.survey.truth, simulated.survey.problem.observations
     point, image = np.asarray(seen.point_index), np.asarray(seen.image_index)
-    chosen = _far_apart(truth.points, np.flatnonzero(np.bincount(point, minlength=len(truth.points)) >= 5),
+    chosen = _far_apart(truth.points, np.flatnonzero(np.bincount(point, minlength=len(truth.points)) >= 6),
                         num_control + num_check)  # fmt: skip
     is_check = np.zeros(len(chosen), bool)
     is_check[np.round(np.linspace(0, len(chosen) - 1, num_check)).astype(int)] = True

@@ -6,17 +6,15 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import gammaincinv, stdtrit
+from scipy.special import gammaincinv
 
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Finding, Photo, Reference, described
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._intrinsics import intrinsics_at_bounds, natural_intrinsics
-from jaxba.sfm._measured import PLAIN_M, used_positions
+from jaxba.sfm._measured import OUTLIER, PLAIN_M, robust_limit, used_positions
 from jaxba.sfm._uncertainty import Uncertainty
 
-_OUTLIER = 3.29  # sigmas: one of a thousand by chance
-_FREEDOM = 0.45  # times n: of Student's t that the residuals of n values over their robust sigma follow (simulated)
 _SCATTER, _SIGNIFICANCE = 1.5, 1e-3
 _WEAK_OBSERVATIONS = 20
 _FOCAL_OFF = 0.05  # from the photos' focal length
@@ -65,8 +63,8 @@ def gnss_fit(block: Block, reference: Reference) -> GnssFit:
     )
     own = np.where(known, reference.std_m[index], np.nan)
     # a plain receiver's sigma of metres is mostly a common offset: what scatters within a flight is judged by itself
-    robust = float(max(-stdtrit(max(_FREEDOM * np.count_nonzero(used), 1.0), 5e-4), _OUTLIER))
-    limit = np.maximum(robust * scale, np.where(own > PLAIN_M, own, _OUTLIER * own))
+    robust = robust_limit(int(np.count_nonzero(used)))
+    limit = np.maximum(robust * scale, np.where(own > PLAIN_M, own, OUTLIER * own))
     with np.errstate(invalid="ignore"):
         outlier = used & np.any(np.abs(residual - middle) > limit, axis=1)
     inlier = used & ~outlier

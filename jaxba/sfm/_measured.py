@@ -1,7 +1,8 @@
-"""Measured positions of a block: which are used, and what they have in common."""
+"""Measured positions of a block: which are used, how they scatter, and what they have in common."""
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.special import chdtrc, stdtrit
 
 from jaxba.scene import Block, Reference
 
@@ -9,6 +10,12 @@ PLAIN_M = 1.0
 """Sigma of a position beyond which it is that of a single receiver."""
 LEAST_POSITIONS = 3
 """Positions that place a block."""
+OUTLIER = 3.29
+"""Sigmas that one of a thousand normal errors exceeds by chance."""
+_FREEDOM = 0.45  # times n: of Student's t that the residuals of n values over their robust sigma follow (simulated)
+_LEAST_TO_SCATTER = 6  # positions
+_LEAST_SCATTER = 0.1  # of a plain receiver's sigma, most of which its positions have in common
+_BY_CHANCE = 1e-3
 _LEAST_COMMON = 0.1  # of a good position's sigma: what all of them have in common, unless control tells it
 
 
@@ -31,6 +38,42 @@ def common_std(block: Block, reference: Reference) -> Float[np.ndarray, "3"] | N
         return None
     std_m = np.median(reference.std_m[index], axis=0)
     return np.where(np.isfinite(std_m), np.where(std_m > PLAIN_M, std_m, _LEAST_COMMON * std_m), 0.0)
+
+
+def robust_limit(count: int) -> float:
+    """Return how many robust sigmas a residual of as many values exceeds by chance in one of a thousand."""
+    return float(max(-stdtrit(max(_FREEDOM * count, 1.0), 5e-4), OUTLIER))
+
+
+def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:
+    """Return what the sigmas of positions are multiplied by, an axis, from how the positions scatter about the block.
+
+    Stated sigmas stand, unless the residuals about their mean contradict them (chi-squared, 0.1%); then they are what
+    the residuals show. Sigmas of more than `PLAIN_M` are those of a single receiver, mostly an offset that all
+    positions of a flight have in common; their scatter alone tells their weight against each other, down to a tenth.
+    Outliers do not count, and under six positions it is 1. A similarity has fitted the block to the positions, which
+    takes seven degrees of freedom from the three axes.
+    """
+    used = used_positions(block, reference)
+    index = block.image_index[used]
+    scale = np.ones(3)
+    for axis in range(3):
+        std = reference.std_m[index, axis]
+        known = np.isfinite(std)
+        if known.sum() < _LEAST_TO_SCATTER:
+            continue
+        residual = ((block.centers_m[used, axis] - reference.xyz_m[index, axis]) / std)[known]
+        residual = residual - np.median(residual)
+        robust = 1.4826 * np.median(np.abs(residual))
+        kept = residual[np.abs(residual) <= robust_limit(len(residual)) * robust]
+        freedom = len(kept) - 7 / 3
+        total = float(np.sum((kept - kept.mean()) ** 2))
+        shown = np.sqrt(total / freedom)
+        if np.median(std[known]) > PLAIN_M:
+            scale[axis] = max(shown, _LEAST_SCATTER)
+        elif shown > 1 and chdtrc(freedom, total) < _BY_CHANCE:
+            scale[axis] = shown
+    return scale
 
 
 def median_offset(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:

@@ -22,14 +22,13 @@ from jaxba.ba import HistoryStep, PlanShape, Problem, Solution, make_plan, repro
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
 from jaxba.scene import Block, Control, Photo, Reference, Tracks
 from jaxba.sfm._control import ControlPart, Standing, before_control, control_part
-from jaxba.sfm._measured import PLAIN_M, used_positions
+from jaxba.sfm._measured import position_scale
 from jaxba.sfm._points import track_rows
 from jaxba.sfm._problem import to_problem, with_solution
 
 _log = logging.getLogger(__name__)
 
 _SPARE = 0.03  # room for tracks that pruning cuts in two
-_LEAST_POSITIONS = 6
 _TRUSTING_ROUNDS = 2
 _TELL_EVERY_S = 1.0
 
@@ -226,29 +225,6 @@ class _Told:
         now_s = time.monotonic()
         self.num_steps, self.begun_s, self.last_s = step.step, now_s, now_s - self.begun_s
         _log.info("round %d, step %d, %.0f s", self.round, step.step, step.seconds)
-
-
-def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]:
-    """Return what the sigmas of positions are multiplied by, an axis, from how the positions scatter about the block.
-
-    The median of |residual| over 0.6745 sigma (its value for a normal distribution), and not below 1: positions may be
-    worse than they claim. Sigmas of more than `PLAIN_M` are those of a single receiver, mostly an offset that all
-    positions of a flight have in common; their scatter alone tells their weight against each other, down to a tenth.
-    Under six positions it is 1.
-    """
-    used = used_positions(block, reference)
-    index = block.image_index[used]
-    scale = np.ones(3)
-    for axis in range(3):
-        std = reference.std_m[index, axis]
-        known = np.isfinite(std)
-        if known.sum() < _LEAST_POSITIONS:
-            continue
-        residual = block.centers_m[used, axis] - reference.xyz_m[index, axis]
-        ratio = np.median(np.abs(residual - np.median(residual))[known] / std[known]) / 0.6745
-        ratio *= np.sqrt(known.sum() / (known.sum() - 7 / 3))  # a similarity has fitted the block to them
-        scale[axis] = max(ratio, 0.1 if np.median(std[known]) > PLAIN_M else 1.0)
-    return scale
 
 
 def without_images(block: Block, gone: Bool[np.ndarray, " images"]) -> Block:

@@ -10,6 +10,7 @@ import pytest
 from jaxba.report import sentences
 from jaxba.scene import Block, Finding, LeftOut, PrunedEdge, Reference
 from jaxba.sfm import Adjusted, Settings, Uncertainty, adjust, findings, gnss_fit, height_above_ground, with_points
+from jaxba.sfm._measured import position_scale
 from jaxba.simulation.staged import Simulated, simulate, true_block
 
 
@@ -194,3 +195,26 @@ def test_a_finding_that_fails_costs_nothing_but_itself(
     )
     assert list(found) == ["note"]
     assert "Scatter of positions could not be measured" in found["note"]["text"] and "index 7" in found["note"]["text"]
+
+
+def test_sigmas_of_positions_stand_unless_their_scatter_contradicts_them(survey: Simulated) -> None:
+    block, rng = true_block(survey), np.random.default_rng(3)
+    centers = block.centers_m
+
+    def scales(noise_m: float, std_m: float, draws: int = 200) -> np.ndarray:
+        std = np.full((12, 3), std_m)
+        positions = (replace(survey.reference, xyz_m=centers + noise_m * rng.normal(size=(12, 3)), std_m=std)
+                     for _ in range(draws))  # fmt: skip
+        return np.array([position_scale(block, reference) for reference in positions])
+
+    assert np.mean(scales(0.02, 0.02) == 1) > 0.98
+    worse = scales(0.10, 0.02)
+    known = np.sqrt(11 / (12 - 7 / 3))  # here nothing has been fitted but their mean
+    assert np.sqrt(np.mean(worse**2)) == pytest.approx(5.0 * known, rel=0.05)
+    plain = scales(1.5, 3.0)
+    assert (plain != 1).all() and np.sqrt(np.mean(plain**2)) == pytest.approx(
+        0.5 * np.sqrt(11 / (12 - 7 / 3)), rel=0.05
+    )
+    apart = replace(survey.reference, xyz_m=centers + 0.02 * rng.normal(size=(12, 3)), std_m=np.full((12, 3), 0.02))
+    apart.xyz_m[4] += 30.0
+    assert (position_scale(block, apart) < 3).all()  # one fix that is off does not make the others worse

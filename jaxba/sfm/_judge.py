@@ -2,9 +2,14 @@
 
 Errors are compared as if all were in long tracks, times `redundancy_root` of theirs: in a track of two views a point
 takes up three quarters of the errors. The limit is median + factor x MAD over all observations, those left out before
-included, so that what was left out returns when it fits and the tail is cut once and not anew in each round: normal
-errors lose 7%. It is at most `track_threshold`, unless the median is still so large that this would leave nothing, and
-not below `f_scale`: what the loss counts in full is no outlier.
+included, so that what was left out returns when it fits and the tail is cut once and not anew in each round. It is at
+most `track_threshold`, unless the median is still so large that this would leave nothing, and not below `f_scale`: what
+the loss counts in full is no outlier.
+
+Nor is it below 3.5 sigmas, as normal errors of that median have them. Median + 2.5 MAD cuts these at 2.3 sigmas: the
+variances of the result grow by a third, which no covariance shows, and the block remembers where it started, since what
+its first camera did not fit stays out: over 32 simulated blocks k2 ended 2 sigmas from the truth on the average (0.1
+with this limit), and errors of points squared were 1.6 times what their sigmas say (1.16).
 """
 
 import numpy as np
@@ -16,6 +21,7 @@ from jaxba.sfm._rounds import Settings
 
 _SETTLED = 0.1  # change of the limit between rounds that is none
 _GROSS = 2.2  # times the limit
+_LEAST = 3.5 / np.sqrt(2 * np.log(2))  # times the median: 3.5 sigmas of errors of two normal coordinates
 _STD_PX = (0.05, 5.0)
 
 
@@ -73,5 +79,5 @@ def _limit(error_px: Float[np.ndarray, " n"], settings: Settings) -> float:
     if not len(error_px):
         return settings.track_threshold
     median = float(np.median(error_px))
-    by_mad = median + settings.mad_factor * float(np.median(np.abs(error_px - median)))
+    by_mad = max(median + settings.mad_factor * float(np.median(np.abs(error_px - median))), _LEAST * median)
     return max(min(by_mad, max(settings.track_threshold, 1.5 * median)), settings.f_scale)

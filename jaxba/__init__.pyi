@@ -41,6 +41,7 @@ from .ba import (
     residuals as residuals,
     solve as solve,
     solve_and_reject as solve_and_reject,
+    solve_and_reweight as solve_and_reweight,
     solve_batch as solve_batch,
     solve_tiled as solve_tiled,
     statistics as statistics,

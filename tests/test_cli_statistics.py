@@ -55,3 +55,20 @@ def test_a_block_without_gauge_is_solved_all_the_same(cli: Cli, tile: Path) -> N
 def test_statistics_of_a_batch_are_refused(cli: Cli, tile: Path) -> None:
     code, _, error = cli("solve", tile, tile.with_name("other.npz"), "--statistics")
     assert code == 2 and "--statistics" in error and "one file" in error
+
+
+def test_estimated_weights_are_told_and_written(cli: Cli, tile: Path) -> None:
+    """Sigmas stated 4 times too large come back; the solved tile has them, so that another solve changes nothing."""
+    problem = jaxba.read_tile(tile)
+    seen = dataclasses.replace(problem.observations, std_px=4.0 * np.asarray(problem.observations.std_px))
+    jaxba.write_tile(tile.with_name("wide.npz"), dataclasses.replace(problem, observations=seen))
+    out = tile.with_name("weighed.npz")
+    code, text, _ = cli("solve", tile.with_name("wide.npz"), "--estimate-weights", "--json", "--out", out)
+    told = json.loads(text)["weights"]
+    assert code == 0 and told["settled"] and told["times"]["tie points"] == pytest.approx(0.25, rel=0.1)
+    std_px = np.asarray(jaxba.read_tile(out).observations.std_px)
+    assert np.median(std_px) == pytest.approx(told["std"]["tie points"])
+    code, text, _ = cli("solve", out, "--estimate-weights", "--out", out.with_name("again.npz"))
+    assert code == 0 and "estimated" in text and "1.00 times what was stated" in text
+    code, _, said = cli("solve", out, "--estimate-weights", "--reject", "mad")
+    assert code == 2 and "--estimate-weights does not go with --reject" in said

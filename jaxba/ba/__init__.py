@@ -11,6 +11,7 @@ from jaxba.ba._propagate import Propagated, propagate
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
 from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
 from jaxba.ba._reliability import NONCENTRALITY, RowStatistics
+from jaxba.ba._reweight import Reweighted, solve_and_reweight
 from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
@@ -67,6 +68,7 @@ __all__ = [
     "Quality",
     "Rejected",
     "Report",
+    "Reweighted",
     "RowStatistics",
     "Rows",
     "SchurDogleg",
@@ -94,6 +96,7 @@ __all__ = [
     "residuals",
     "solve",
     "solve_and_reject",
+    "solve_and_reweight",
     "solve_batch",
     "solve_tiled",
     "statistics",

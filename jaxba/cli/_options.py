@@ -98,6 +98,14 @@ class SolveOptions:
             help="After the solve: variance components, tests of all measurements, correlations of the intrinsics.",
         ),
     ] = False
+    estimate_weights: Annotated[
+        bool,
+        Parameter(
+            negative="",
+            show_default=False,
+            help="Estimate the sigma of each kind of measurement from its residuals, and solve until it stands.",
+        ),
+    ] = False
     out: Annotated[
         Path | None,
         Parameter(

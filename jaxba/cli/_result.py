@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.ba import Problem, Rejected, Report, Statistics
+from jaxba.ba import Problem, Rejected, Report, Reweighted, Statistics
 from jaxba.cli._options import SolveOptions
-from jaxba.cli._statistics import statistics_facts, statistics_rows
+from jaxba.cli._statistics import statistics_facts, statistics_rows, weights_facts, weights_rows
 from jaxba.cli._text import first_of, gauge_text, many, table
 from jaxba.geometry import AbstractLoss, Linear
 
@@ -37,6 +37,7 @@ class Run:
     options: SolveOptions
     seconds: float
     statistics: Statistics | str | None = None
+    weights: Reweighted | None = None
 
     @property
     def report(self) -> Report:
@@ -106,6 +107,7 @@ def facts(run: Run) -> dict[str, object]:
             {"step": step.step, "seconds": step.seconds, "cost": step.cost, "accepted": step.accepted}
             for step in report.history
         ],
+        **({} if run.weights is None else {"weights": weights_facts(run.weights)}),
         **({} if run.statistics is None else {"statistics": statistics_facts(run.statistics)}),
     }
 
@@ -143,6 +145,7 @@ def summary(run: Run) -> str:
             ),
             ("intrinsics", _refined(run)),
             ("at bounds", first_of(bounds, _MOST_BOUNDS) if bounds else []),
+            *(weights_rows(run.weights) if run.weights is not None else ()),
             *(statistics_rows(run.statistics) if run.statistics is not None else ()),
             ("written", str(run.out)),
         )

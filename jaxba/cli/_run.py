@@ -17,7 +17,7 @@ from jaxba.cli._text import first_of, labelled, many, to_json, wrapped
 from jaxba.engine import changed
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.pipeline import Event, Run, run_pipeline
-from jaxba.report import control_rows
+from jaxba.report import accuracy_row, control_rows
 
 _SUMMARY_LABEL = 12
 
@@ -106,7 +106,10 @@ def _print_summary(result: Run, out: Path) -> None:
     facts = result.facts
     rows: list[tuple[str, str]] = []
     if "adjust" in facts:
-        rows = _result_rows(facts["adjust"], control_rows(facts.get("control")))
+        control = control_rows(facts.get("control"))
+        if "accuracy" in facts:
+            control.append(("accuracy", accuracy_row(facts["accuracy"])))
+        rows = _result_rows(facts["adjust"], control)
     if facts.get("crs", {}).get("name") and "export" in facts:
         code = facts["crs"]["epsg"]
         rows.append(("CRS", facts["crs"]["name"] + (f" (EPSG:{code})" if code else "")))

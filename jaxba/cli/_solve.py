@@ -9,13 +9,24 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 from jaxba._atomic import refuse_same_file, refuse_unwritable
 from jaxba._errors import JaxbaError
-from jaxba.ba import HistoryStep, Problem, Rejected, Statistics, solve_and_reject, solve_tiled, statistics
+from jaxba.ba import (
+    HistoryStep,
+    Problem,
+    Rejected,
+    Reweighted,
+    Statistics,
+    solve_and_reject,
+    solve_and_reweight,
+    solve_tiled,
+    statistics,
+)
 from jaxba.cli import _progress
 from jaxba.cli._options import INTERRUPTED, NOT_CONVERGED, SolveOptions
 from jaxba.cli._result import Run, facts, summary
@@ -54,10 +65,13 @@ def run(file: Path, options: SolveOptions) -> int:
     standing = _checkpoint(out, options)
     if standing is not None and standing.exists():
         print(f"jaxba: going on from {standing}, where a solve before this one stopped.", file=sys.stderr)
+    weights = _weights(problem, loss, options)
+    problem = problem if weights is None else weights.problem
     found = _adjust(problem, loss, options, standing)
     seconds = time.perf_counter() - begin
     _write(out, given, problem, found, extras)
-    done = Run(file, out, given, problem, found, loss, options, seconds, _statistics(problem, found, loss, options))
+    told = _statistics(problem, found, loss, options)
+    done = Run(file, out, given, problem, found, loss, options, seconds, told, weights)
     if options.json:
         print(to_json(facts(done)))
     elif not options.quiet:
@@ -227,6 +241,22 @@ def _adjust(problem: Problem, loss: AbstractLoss, options: SolveOptions, checkpo
         else:
             settings |= {"method": options.method, "linear_solver": options.linear_solver}
         return solve_and_reject(problem, rounds=rounds_of(options), mad_factor=options.mad_factor, **settings)
+
+
+def _weights(problem: Problem, loss: AbstractLoss, options: SolveOptions) -> Reweighted | None:
+    """Return the problem with its sigmas as they were estimated; None where that is not asked for.
+
+    Raises `JaxbaError` together with rejection, and where there are no statistics.
+    """
+    if not options.estimate_weights:
+        return None
+    if options.reject:
+        raise JaxbaError("--estimate-weights does not go with --reject: give a robust --loss, which lets go by itself.")
+    stops = {"max_nfev": options.max_nfev, "ftol": options.ftol, "xtol": options.xtol, "gtol": options.gtol}
+    by: dict[str, Any] = {"method": options.method, "linear_solver": options.linear_solver}
+    if options.tiled:
+        by = {"solver": functools.partial(solve_tiled, max_memory=options.max_memory)}
+    return solve_and_reweight(problem, loss=loss, max_memory=options.max_memory, **by, **stops)
 
 
 def rounds_of(options: SolveOptions) -> int:

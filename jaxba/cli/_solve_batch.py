@@ -47,7 +47,7 @@ from jaxba.io import (
 
 _AT_A_TIME = 1e7
 _FROM, _RESULT, _CONVERGED = "solved_from", "solved_result", "solved_converged"  # extras
-_OUTPUT_OPTIONS = ("out", "json", "quiet", "verbose", "statistics")
+_OUTPUT_OPTIONS = ("out", "json", "quiet", "verbose", "statistics", "estimate_weights")
 
 
 @dataclasses.dataclass(eq=False)
@@ -256,6 +256,7 @@ def _refuse_for_several(options: SolveOptions) -> None:
         (options.linear_solver != "auto", f"--linear-solver {options.linear_solver}"),
         (options.verbose, "--verbose"),
         (options.statistics, "--statistics"),
+        (options.estimate_weights, "--estimate-weights"),
     ):
         if is_given:
             raise JaxbaError(f"{name}: is for one file, and several are solved at a time here; leave it out.")

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxba.ba import RowStatistics, Statistics
+from jaxba.ba import Reweighted, RowStatistics, Statistics
 from jaxba.cli._text import first_of
 
 _SHOWN = 6
@@ -59,6 +59,32 @@ def statistics_rows(found: Statistics | str) -> list[tuple[str, list[str]]]:
         ("tests", [*tests, *([f"largest: {first_of(named, _SHOWN)}"] if named else [])]),
         ("correlated", [first_of(pairs, _SHOWN)] if pairs else []),
     ]
+
+
+def weights_facts(found: Reweighted) -> dict[str, Any]:
+    """Return the estimated sigmas by kind, for `--json`."""
+    return {"times": found.times, "std": _stds(found), "at_limit": list(found.at_limit), "settled": found.is_settled}
+
+
+def weights_rows(found: Reweighted) -> list[tuple[str, list[str]]]:
+    """Return the row of the summary in words."""
+    texts = []
+    for component in found.statistics.components:
+        if not component.is_known:
+            texts.append(f"{component.name}: kept, its redundancy is {component.redundancy:.1f}")
+            continue
+        share = component.factor_std / (2 * max(component.factor, 1e-12))
+        text = f"{component.name}: {_stds(found)[component.name]:.3g} +- {share:.0%}"
+        text += f", {found.times[component.name]:.2f} times what was stated"
+        texts.append(text + (", the most that is allowed" if component.name in found.at_limit else ""))
+    if not found.is_settled:
+        texts.append(f"still changing after {len(found.solutions)} rounds")
+    return [("estimated", texts)]
+
+
+def _stds(found: Reweighted) -> dict[str, float]:
+    """Return the sigma that each kind was solved with, in its own unit."""
+    return {component.name: component.stated_std for component in found.statistics.components}
 
 
 def _component_text(component: Any) -> str:

@@ -7,6 +7,9 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxba._errors import JaxbaError
 
+STD_COLUMNS = ("std_x_m", "std_y_m", "std_z_m")
+"""Names of a point's sigmas in all formats: along local east, north, up."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cloud:

@@ -3,8 +3,8 @@
 LAS stores whole numbers: `coordinate = offset + scale * number`. Scale is 0.001 of the CRS's unit, the offset the whole
 number of units nearest to the cloud's middle, so that a coordinate is off by half a scale at most wherever the cloud
 lies. The CRS stands in the header as well-known text, compound with its heights where it is. Colours are 16 bits wide:
-255 becomes 65535. Errors and track lengths are extra dimensions. The date in the header is the day of the flight, or
-none: the same cloud gives the same bytes.
+255 becomes 65535. Errors, track lengths and sigmas (NaN where not known) are extra dimensions. The date in the header
+is the day of the flight, or none: the same cloud gives the same bytes.
 """
 
 import datetime
@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxba._atomic import write_atomically
 from jaxba._errors import JaxbaError
-from jaxba.io._cloud import Cloud
+from jaxba.io._cloud import STD_COLUMNS, Cloud
 from jaxba.io._crs import CrsText
 
 SCALE = 0.001
@@ -66,6 +66,10 @@ def write_las(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText, *, date:
             laspy.ExtraBytesParams(name="error_px", type="float32", description="mean reprojection error"),
             laspy.ExtraBytesParams(name="track_length", type="uint16", description="images that show it"),
             laspy.ExtraBytesParams(name="point_id", type="uint32", description="as in the other files"),
+            *(
+                laspy.ExtraBytesParams(name=name, type="float32", description=f"sigma along local {axis}, metres")
+                for name, axis in zip(STD_COLUMNS, ("east", "north", "up"), strict=True)
+            ),
         ]
     )
     las = laspy.LasData(header)
@@ -76,6 +80,8 @@ def write_las(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText, *, date:
     las["error_px"] = cloud.error_px.astype(np.float32)
     las["track_length"] = np.minimum(cloud.track_length, 2**16 - 1).astype(np.uint16)
     las["point_id"] = cloud.point_id.astype(np.uint32)
+    for name, column in zip(STD_COLUMNS, cloud.std_m.T, strict=True):
+        las[name] = column.astype(np.float32)
     buffer = io.BytesIO()
     las.write(buffer, do_compress=label.lower().endswith(".laz"))
     content = bytearray(buffer.getvalue())

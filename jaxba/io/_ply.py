@@ -1,4 +1,4 @@
-"""Point cloud as binary PLY (little-endian): coordinates in full doubles, colours, errors.
+"""Point cloud as binary PLY (little-endian): coordinates in full doubles, colours, errors, sigmas (NaN: not known).
 
 Coordinates are those of the target CRS, not shifted. Programs that read them as float32 round a northing of some
 5,000,000 m to half a metre: load with a global shift (CloudCompare proposes one), or take the LAZ file, which has an
@@ -10,13 +10,14 @@ import os
 import numpy as np
 
 from jaxba._atomic import write_atomically
-from jaxba.io._cloud import Cloud
+from jaxba.io._cloud import STD_COLUMNS, Cloud
 from jaxba.io._crs import CrsText
 
 VERTEX = np.dtype(
     [(name, "<f8") for name in "xyz"]
     + [(name, "u1") for name in ("red", "green", "blue")]
     + [("error_px", "<f4"), ("track_length", "<i4"), ("point_id", "<i4")]
+    + [(name, "<f4") for name in STD_COLUMNS]
 )
 PLY_TYPES = {"<f8": "double", "|u1": "uchar", "<f4": "float", "<i4": "int"}
 
@@ -44,6 +45,8 @@ def write_ply(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText | None) -
         vertices[name] = column
     for name in ("error_px", "track_length", "point_id"):
         vertices[name] = getattr(cloud, name)
+    for name, column in zip(STD_COLUMNS, cloud.std_m.T, strict=True):
+        vertices[name] = column
     place = "local coordinates without a place on earth"
     if crs is not None:
         code = f"EPSG:{crs.code} " if crs.code else ""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.io._cloud import Cloud
+from jaxba.io._cloud import STD_COLUMNS, Cloud
 from jaxba.io._csv_cloud import CLOUD_COLUMNS
 from jaxba.io._ply import PLY_TYPES, VERTEX
 from jaxba.io._read import read_bytes, text_of
@@ -20,14 +20,14 @@ from jaxba.io._read import read_bytes, text_of
 _FORMAT = b"ply\nformat binary_little_endian 1.0\n"
 _END = b"end_header\n"
 _LAS_FORMAT = (1, 4, 7)
-_LAS_EXTRA = ("error_px", "track_length", "point_id")
+_LAS_EXTRA = ("error_px", "track_length", "point_id", *STD_COLUMNS)
 _COLOURS = {"R": "red", "G": "green", "B": "blue"}
 _CURE = "it was changed or damaged; export it again"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CloudFile:
-    """- `cloud`: its `std_m` is NaN where the format has none. `crs`: a code or WKT, as the file says; empty: none."""
+    """- `cloud`: as it was written. `crs`: a code or WKT, as the file says; empty: none."""
 
     cloud: Cloud
     crs: str
@@ -155,8 +155,7 @@ def _cloud(label: str, numbers: dict[str, np.ndarray]) -> Cloud:
                 f"{_CURE}."
             )
         whole[name] = values.astype(np.int64)
-    count = len(whole["PointID"])
-    stds = [numbers.get(f"std_{axis}_m", np.full(count, np.nan)) for axis in "xyz"]
+    stds = [numbers[name] for name in STD_COLUMNS]
     return Cloud(
         xyz=np.stack([numbers[axis] for axis in "XYZ"], axis=1),
         rgb=np.stack([whole[colour] for colour in "RGB"], axis=1).astype(np.uint8),

@@ -102,6 +102,7 @@ def _files(frame: LocalFrame | None, files: Sequence[str]) -> list[str]:
                 "x, y, z": "as X, Y, Z of cloud.csv, not rounded",
                 "red, green, blue": "of the images, 0 to 255",
                 "error_px, track_length, point_id": "as in cloud.csv",
+                "std_x_m, std_y_m, std_z_m": "as in cloud.csv; NaN where it was not computed",
             },
         ),
         "cloud.laz": (
@@ -110,6 +111,7 @@ def _files(frame: LocalFrame | None, files: Sequence[str]) -> list[str]:
                 "X, Y, Z": "as in cloud.csv, to a thousandth of the unit",
                 "red, green, blue": "of the images, 16 bits: 255 is 65535",
                 "error_px, track_length, point_id": "as in cloud.csv",
+                "std_x_m, std_y_m, std_z_m": "as in cloud.csv; NaN where it was not computed",
             },
         ),
         "cloud.png": ("the cloud from above", {}),

@@ -82,7 +82,9 @@ class Outputs:
     - `gnss_residual_m`: adjusted minus measured position; NaN where none was used.
     - `median_px`, `inlier_rate`, `variance_factor`, `num_rejected`, `rounds`: figures of the adjustment.
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
-    - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions, an axis.
+    - `std_px`: sigma of an observation's coordinates. `spread`: times it that errors really bear on the result, which
+      the sigmas of the results allow for. `loss`, `loss_f_scale`: of the observations, its scale in those sigmas.
+    - `position_scale`: factor on the sigmas of positions, an axis.
     - `pruned`: edges left out, with their figures. `solver`: why the last solve stopped, as `Solution.result` names it.
     - `common`: what positions have in common as an unknown of the last solve; None where it was none.
     - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
@@ -114,6 +116,9 @@ class Outputs:
     control: ControlFit = field(default_factory=ControlFit.nothing)
     mark_used: Bool[np.ndarray, " marks"] = field(default_factory=lambda: np.zeros(0, bool))
     mark_std_px: float = 1.0
+    spread: float = 1.0
+    loss: str = "linear"
+    loss_f_scale: float = 1.0
     affine: Float[np.ndarray, "3 4"] = field(default_factory=lambda: np.eye(3, 4))
 
     @property
@@ -197,6 +202,9 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         control=controlled.fit,
         mark_used=adjusted.mark_used,
         mark_std_px=adjusted.mark_std_px,
+        spread=adjusted.spread,
+        loss=params.loss,
+        loss_f_scale=float(adjusted.loss.f_scale) / adjusted.spread,
         affine=controlled.affine,
     )
 

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.engine._parameters import Parameters
+from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._store import sha256
 from jaxba.engine._words import many
 from jaxba.pipeline import adjust
 from jaxba.pipeline._export_readme import readme, why_empty
-from jaxba.report import Told
+from jaxba.report import Accuracy, Told, accuracy, accuracy_row
 from jaxba.scene import Block, Control, LocalFrame, Photo, Reference, described
 
 _README = "README.txt"
@@ -42,17 +42,24 @@ class Inputs:
 class Params(Parameters):
     """What the user may set."""
 
+    accuracy_h: float | None = parameter(
+        None, low=0.0001, high=100, help="horizontal RMSE that the product is to have by its check points, metres"
+    )
+    accuracy_v: float | None = parameter(None, low=0.0001, high=100, help="vertical RMSE, likewise")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
     """What was written.
 
     - `files`: names, below the folder. `sha256`: of each. `notes`: what a reader of the files should know.
+    - `accuracy`: of the product by its check points; None without any.
     """
 
     files: tuple[str, ...]
     sha256: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    accuracy: Accuracy | None = None
 
 
 def run(inputs: Inputs, params: Params) -> Outputs:
@@ -90,19 +97,25 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     notes += odd
     if picture is not None:
         _write(folder / "cloud.png", picture)
+    target_m = tuple(np.nan if value is None else value for value in (params.accuracy_h, params.accuracy_v))
+    found = accuracy(inputs.control, adjusted.control, (float(target_m[0]), float(target_m[1])))
+    if found is not None:
+        notes.append(f"Accuracy: {accuracy_row(found.facts())}.")
     names = sorted([*(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()), _README])
     _write(folder / _README, readme(frame, adjusted, notes, names).encode())
-    return Outputs(files=tuple(names), sha256=tuple(sha256(folder / name) for name in names), notes=tuple(notes))
+    hashes = tuple(sha256(folder / name) for name in names)
+    return Outputs(files=tuple(names), sha256=hashes, notes=tuple(notes), accuracy=found)
 
 
 def lines(outputs: Outputs, told: Told) -> list[str]:
     """Return what was made, in words."""
-    return [many(len(outputs.files), "file"), *outputs.notes]
+    return [many(len(outputs.files), "file"), *(note for note in outputs.notes if not note.startswith("Accuracy:"))]
 
 
 def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
     """Return the files and what a reader of them should know."""
-    return {"export": {"files": list(outputs.files), "notes": list(outputs.notes)}}
+    made = {"export": {"files": list(outputs.files), "notes": list(outputs.notes)}}
+    return made if outputs.accuracy is None else made | {"accuracy": outputs.accuracy.facts()}
 
 
 def _mapped(inputs: Inputs, xyz_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -216,7 +229,7 @@ def _write_tile(inputs: Inputs) -> list[str]:
     """Write the block as a problem that `jaxba solve` takes; return what it leaves out."""
     from jaxba.ba import PRIORS
     from jaxba.io import write_tile
-    from jaxba.sfm import control_part, to_problem
+    from jaxba.sfm import control_part, to_problem, weighed
 
     adjusted = inputs.adjusted
     block = adjusted.block
@@ -230,10 +243,13 @@ def _write_tile(inputs: Inputs) -> list[str]:
         control=control_part(block, control, adjusted.mark_used, adjusted.control.used_std_m),
         common=adjusted.common,
     )
+    problem = weighed(problem, adjusted.spread, block.num_observations)
     known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
     left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]
     write_tile(inputs.folder / "tile.npz", dataclasses.replace(problem, priors=known))
     notes = [f"tile.npz leaves out the priors that its format has no arrays for: {', '.join(left)}."] if left else []
+    scale = "" if adjusted.loss == "linear" else f" --f-scale {adjusted.loss_f_scale:.4g}"
+    notes.append(f"tile.npz has the sigmas that the results' follow from; solve it with --loss {adjusted.loss}{scale}.")
     if adjusted.control.method in ("helmert", "affine"):
         notes.append(
             "tile.npz starts at the block as it was fitted to control afterwards, and holds none: solving it takes the "

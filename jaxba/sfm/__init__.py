@@ -11,11 +11,12 @@ from jaxba.sfm._intrinsics import AtBound, free_parameters, intrinsics_at_bounds
 from jaxba.sfm._points import with_points
 from jaxba.sfm._problem import positions_hold, to_problem
 from jaxba.sfm._rounds import Settings, Tiling
+from jaxba.sfm._spread import weighed
 from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [
     "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Tiling", "Uncertainty", "adjust", "agreeing_marks",
     "apply_affine", "apply_control", "control_findings", "control_part", "findings", "free_parameters", "gnss_fit",
     "height_above_ground", "initialise", "intrinsics_at_bounds", "place_by_control", "positions_hold", "to_problem",
-    "uncertainty", "with_points",
+    "uncertainty", "weighed", "with_points",
 ]  # fmt: skip

@@ -32,6 +32,7 @@ from jaxba.sfm._judge import estimate_std, judge, used_in_track
 from jaxba.sfm._onto_control import OnControl, onto_control
 from jaxba.sfm._points import apply_points, triangulate_tracks
 from jaxba.sfm._rounds import Rounds, Settings, Solved, Tiling, without_images
+from jaxba.sfm._spread import spread
 
 _log = logging.getLogger(__name__)
 
@@ -77,6 +78,11 @@ class Adjusted:
     control: ControlPart | None = None
     on_control: OnControl | None = None
     max_memory: float | str | None = None
+
+    @property
+    def spread(self) -> float:
+        """Times `std_px` that the errors of observations bear on the result."""
+        return spread(self.block, self.error_px, self.std_px, self.loss)
 
     @property
     def num_rejected(self) -> int:

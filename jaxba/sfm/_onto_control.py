@@ -107,7 +107,8 @@ def _misclosure(
     moves = np.zeros(3) if common_std_m is None else common_std_m
     block, rows = solved.block, part.rows
     times = spread(block, solved.error_px, std_px, solved.loss)
-    problem, loss = weighed(solved.problem, solved.loss, times, block.num_observations)
+    problem = weighed(solved.problem, times, block.num_observations)
+    loss = dataclasses.replace(solved.loss, f_scale=solved.loss.f_scale / times)
     numbers = jnp.arange(len(rows)) + block.num_points
     free = propagate(lambda p: p.points[numbers], without_control(problem), loss=loss, max_memory=max_memory)
     covariance = free.covariance.reshape(len(rows), 3, len(rows), 3)

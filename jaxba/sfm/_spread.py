@@ -73,10 +73,11 @@ def position_spread(problem: Problem, prior: PositionPrior) -> float:
     return float(np.clip(found, *_MOST_SPREAD))
 
 
-def weighed(problem: Problem, loss: AbstractLoss, times: float, num_own: int) -> tuple[Problem, AbstractLoss]:
-    """Return a problem and its loss with the sigmas of observations and positions as their errors show them.
+def weighed(problem: Problem, times: float, num_own: int) -> Problem:
+    """Return a problem with the sigmas of observations and positions as their errors show them.
 
-    Those of its first `num_own` observations are multiplied by `times`; marks' stand.
+    Those of its first `num_own` observations are multiplied by `times`, by which the scale of their loss is to be
+    divided; marks' stand.
     """
     observations = problem.observations
     std_px = np.concatenate([observations.std_px[:num_own] * times, observations.std_px[num_own:]])
@@ -85,9 +86,8 @@ def weighed(problem: Problem, loss: AbstractLoss, times: float, num_own: int) ->
         if not isinstance(prior, PositionPrior) or not isinstance(prior.loss, GemanMcClure):
             return prior
         by = position_spread(problem, prior)
-        loss = GemanMcClure(prior.loss.f_scale / by)
-        return dataclasses.replace(prior, std_m=np.asarray(prior.std_m) * by, loss=loss)
+        std_m = np.asarray(prior.std_m) * by
+        return dataclasses.replace(prior, std_m=std_m, loss=GemanMcClure(prior.loss.f_scale / by))
 
     observations = dataclasses.replace(observations, std_px=std_px)
-    problem = dataclasses.replace(problem, observations=observations, priors=tuple(map(of, problem.priors)))
-    return problem, dataclasses.replace(loss, f_scale=loss.f_scale / times)
+    return dataclasses.replace(problem, observations=observations, priors=tuple(map(of, problem.priors)))

@@ -30,7 +30,7 @@ from jaxba.sfm._cores import on_all_cores
 from jaxba.sfm._measured import used_positions
 from jaxba.sfm._points import pieces
 from jaxba.sfm._rays import make_rays
-from jaxba.sfm._spread import spread, weighed
+from jaxba.sfm._spread import weighed
 
 _PIECE = 100_000  # observations worked on at a time by a core
 _LEAST_TRACKS, _LEAST_FREEDOM = 100, 3  # to tell how variances are distributed
@@ -57,8 +57,9 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured."""
     block = adjusted.block
     position, point = np.full((block.num_images, 3), np.nan), np.full((block.num_points, 3), np.nan)
-    times = spread(block, adjusted.error_px, adjusted.std_px, adjusted.loss)
-    problem, loss = weighed(adjusted.problem, adjusted.loss, times, block.num_observations)
+    times = adjusted.spread
+    problem = weighed(adjusted.problem, times, block.num_observations)
+    loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
         found = covariance(problem, loss=loss, max_memory=adjusted.max_memory)
     except JaxbaError as error:

@@ -90,3 +90,18 @@ def test_tables_hold_a_row_for_each_measurement() -> None:
     assert total == pytest.approx(found.covariance.redundancy, abs=1e-6)
     with pytest.raises(JaxbaError, match="no prior 'attitude'; it has position, control"):
         found.prior_frame("attitude")
+
+
+def test_weights_are_estimated_in_the_adjustment_that_uses_them() -> None:
+    problem = wrongly_weighed(0.0)
+    found = jaxba.solve_and_reweight(problem, most=1e3)
+    assert found.is_settled and not found.at_limit and len(found.solutions) > 2
+    stated = problem.prior("position").std_m  # type: ignore[union-attr]
+    estimated = found.problem.prior("position").std_m  # type: ignore[union-attr]
+    np.testing.assert_allclose(estimated[:, 2] / stated[:, 2], found.times["position vertical"], rtol=1e-12)
+    position = next(c for c in found.statistics.components if c.name == "position vertical")
+    assert position.std == pytest.approx(GNSS_STD_M[2], rel=3 / np.sqrt(2 * position.redundancy))
+    assert found.times["tie points"] * problem.observations.std_px[0] == pytest.approx(PIXEL_STD_PX, rel=0.05)
+    held = jaxba.solve_and_reweight(problem, most=1.2, rounds=3)
+    assert "position vertical" in held.at_limit
+    assert all(1 / 1.2 - 1e-9 < times < 1.2 + 1e-9 for times in held.times.values())

@@ -134,7 +134,7 @@ def test_other_words_rerun_nothing(with_change, stage: str, module: str, before:
         ("adjust", "jaxba.pipeline.adjust", "sigmas = controlled.sigmas", "sigmas = sigmas"),
         ("adjust", "jaxba.pipeline.adjust", "import numpy as np", "import jax.numpy as np"),  # the same name
         ("match", "jaxba.pipeline.features", "def run(inputs", "def run( inputs"),  # detects where SIFT is the fallback
-        ("adjust", "jaxba.sfm._findings", "_OUTLIER = 3.0", "_OUTLIER = 4.0"),
+        ("adjust", "jaxba.sfm._findings", "_WEAK_OBSERVATIONS = 20", "_WEAK_OBSERVATIONS = 30"),
         ("export", "jaxba.io._las", "def write_las(", "def write_laz("),  # of a package that is imported whole
         ("export", "jaxba.report._picture", "MOST_POINTS = 200_000", "MOST_POINTS = 100_000"),  # is a file of its own
     ],

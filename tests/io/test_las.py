@@ -44,6 +44,8 @@ def test_colours_errors_and_track_lengths_are_there(tmp_path: Path):
     np.testing.assert_allclose(las["error_px"], cloud.error_px, rtol=1e-7)  # float32
     assert np.array_equal(las["track_length"], cloud.track_length)
     assert np.array_equal(las["point_id"], cloud.point_id)
+    sigmas = np.stack([las[f"std_{axis}_m"] for axis in "xyz"], axis=1)
+    np.testing.assert_array_equal(sigmas, cloud.std_m.astype(np.float32))
 
 
 @pytest.mark.parametrize("text", ["EPSG:32615", "EPSG:32615+5773", "EPSG:2225", "EPSG:6339+5703"])

@@ -30,6 +30,8 @@ def test_points_come_back_exactly_with_colours_and_errors(tmp_path: Path):
     assert np.array_equal(np.stack([vertices[c] for c in ("red", "green", "blue")], 1), cloud.rgb)
     assert np.array_equal(vertices["error_px"], cloud.error_px.astype(np.float32))
     assert np.array_equal(vertices["point_id"], cloud.point_id)
+    sigmas = np.stack([vertices[f"std_{axis}_m"] for axis in "xyz"], axis=1)
+    np.testing.assert_array_equal(sigmas, cloud.std_m.astype(np.float32))
     assert comments == ["comment crs EPSG:32615 WGS 84 / UTM zone 15N; unit metre, of heights metre"]
 
 

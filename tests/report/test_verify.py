@@ -58,6 +58,7 @@ def test_clouds_read_back_are_one(made: Survey):
         np.testing.assert_allclose(other.xyz, csv.xyz, atol=0.0015)  # thousandths, rounded twice
         assert (other.point_id == csv.point_id).all() and (other.rgb == csv.rgb).all()
         assert (other.track_length == csv.track_length).all()
+        np.testing.assert_allclose(other.std_m, csv.std_m, rtol=1e-6, atol=6e-4)  # the CSV has millimetres
 
 
 def test_a_nan_in_the_cloud(export: Path):

@@ -21,7 +21,15 @@ from jaxba.ba._covariance import Covariance, marginals_at
 from jaxba.ba._leverage import Leverage
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._reliability import RowStatistics, row_statistics
-from jaxba.ba._tables import DataFrame, components_table, observations_table, prior_table
+from jaxba.ba._tables import (
+    DataFrame,
+    cameras_table,
+    components_table,
+    images_table,
+    observations_table,
+    points_table,
+    prior_table,
+)
 from jaxba.ba._variance_components import VarianceComponent, reweighted, variance_components
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS
 from jaxba.geometry import AbstractLoss, Linear, require_number
@@ -74,6 +82,18 @@ class Statistics:
         rows = self.prior(name)
         assert prior is not None  # or there were no rows of it
         return prior_table(self.problem, prior, rows)
+
+    def images_frame(self) -> DataFrame:
+        """Return the table of images: places and orientations with their sigmas and ellipses of errors."""
+        return images_table(self.problem, self.covariance)
+
+    def points_frame(self) -> DataFrame:
+        """Return the table of points, likewise."""
+        return points_table(self.problem, self.covariance)
+
+    def cameras_frame(self) -> DataFrame:
+        """Return the table of intrinsics: a row for each parameter of each camera."""
+        return cameras_table(self.problem, self.covariance)
 
     def components_frame(self) -> DataFrame:
         """Return the table of variance components."""

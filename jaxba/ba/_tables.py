@@ -5,6 +5,13 @@
 
 and so for every prior, whose first columns say what each row is about. What the other columns mean stands at the fields
 of `RowStatistics`.
+
+    images, points: x_m, y_m, z_m of camera or point, std_x_m, ..., ellipse_a_m, ellipse_b_m, ellipse_azimuth_deg,
+                    num_observations; images also camera and std_rot_x_rad, ... about the camera's axes
+    cameras:        camera, parameter, value, std
+
+The ellipse is that of one sigma in the x-y plane (39% of a normal distribution): semi-axes, and the azimuth of the
+longer one from y (north) over x (east).
 """
 
 from typing import TYPE_CHECKING, Any
@@ -17,6 +24,7 @@ from jaxba.ba._reliability import RowStatistics
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+    from jaxba.ba._covariance import Covariance
     from jaxba.ba._variance_components import VarianceComponent
 else:
     DataFrame = Any
@@ -48,6 +56,62 @@ def prior_table(problem: Problem, prior: AbstractPrior, rows: RowStatistics) -> 
     axes = names if components == len(names) and hasattr(prior, "parameters") else ("x", "y", "z")
     unit = next((unit for field, unit in _UNIT.items() if hasattr(prior, field)), "")
     return _table(about, rows, axes if components > 1 else ("",), unit)
+
+
+def images_table(problem: Problem, covariance: "Covariance") -> DataFrame:
+    """Return a row for each image: its camera's place and orientation, and how well these are known."""
+    import pandas as pd
+
+    turns = np.sqrt(np.maximum(np.einsum("nii->ni", covariance.poses[:, :3, :3]), 0.0))
+    numbers = np.arange(problem.num_images)
+    columns = {"image": _images(problem, numbers), "camera": np.asarray(problem.camera_index)}
+    columns |= _places(np.asarray(problem.poses.center), covariance.centers)
+    columns |= {f"std_rot_{axis}_rad": turns[:, k] for k, axis in enumerate("xyz")}
+    seen = np.asarray(problem.observations.image_index)
+    columns["num_observations"] = np.bincount(seen, minlength=problem.num_images)
+    return pd.DataFrame(columns)
+
+
+def points_table(problem: Problem, covariance: "Covariance") -> DataFrame:
+    """Return a row for each point: where it lies, and how well that is known."""
+    import pandas as pd
+
+    columns = {"point": np.arange(problem.num_points)}
+    columns |= _places(np.asarray(problem.points), covariance.points)
+    seen = np.asarray(problem.observations.point_index)
+    columns["num_observations"] = np.bincount(seen, minlength=problem.num_points)
+    return pd.DataFrame(columns)
+
+
+def cameras_table(problem: Problem, covariance: "Covariance") -> DataFrame:
+    """Return a row for each parameter of each camera."""
+    import pandas as pd
+
+    names = type(problem.cameras).parameter_names()
+    shape = problem.num_cameras, len(names)
+    values = np.stack([np.broadcast_to(getattr(problem.cameras, name), shape[:1]) for name in names], axis=1)
+    std = np.sqrt(np.maximum(np.einsum("nii->ni", covariance.intrinsics), 0.0))
+    camera, parameter = np.indices(shape)
+    return pd.DataFrame(
+        {
+            "camera": camera.ravel(),
+            "parameter": np.array(names)[parameter.ravel()],
+            "value": values.ravel(),
+            "std": std.ravel(),
+        }
+    )
+
+
+def _places(xyz_m: np.ndarray, covariance_m2: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns of places: coordinates, sigmas, and the ellipse of errors in the x-y plane."""
+    std = np.sqrt(np.maximum(np.einsum("nii->ni", covariance_m2), 0.0))
+    columns = {f"{axis}_m": xyz_m[:, k] for k, axis in enumerate("xyz")}
+    columns |= {f"std_{axis}_m": std[:, k] for k, axis in enumerate("xyz")}
+    values, vectors = np.linalg.eigh(covariance_m2[:, :2, :2])
+    semi_axes = np.sqrt(np.maximum(values, 0.0))
+    columns |= {"ellipse_a_m": semi_axes[:, 1], "ellipse_b_m": semi_axes[:, 0]}
+    columns["ellipse_azimuth_deg"] = np.degrees(np.arctan2(vectors[:, 0, 1], vectors[:, 1, 1])) % 180.0
+    return columns
 
 
 def components_table(components: "tuple[VarianceComponent, ...]") -> DataFrame:

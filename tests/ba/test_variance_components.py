@@ -88,6 +88,19 @@ def test_tables_hold_a_row_for_each_measurement() -> None:
         found.prior_frame(name).filter(like="redundancy").to_numpy().sum() for name in ("position", "control")
     )
     assert total == pytest.approx(found.covariance.redundancy, abs=1e-6)
+    points, images, cameras = found.points_frame(), found.images_frame(), found.cameras_frame()
+    np.testing.assert_array_equal(points["std_z_m"], np.sqrt(found.covariance.points[:, 2, 2]))
+    assert points["num_observations"].sum() == images["num_observations"].sum() == problem.num_observations
+    np.testing.assert_array_equal(images["x_m"], np.asarray(found.problem.poses.center)[:, 0])
+    np.testing.assert_array_equal(images["std_rot_z_rad"], np.sqrt(found.covariance.poses[:, 2, 2]))
+    focal = cameras.set_index("parameter").loc["fx"]
+    assert focal["value"] == np.ravel(found.problem.cameras.fx)[0] and focal["std"] > 0  # type: ignore[attr-defined]
+    # the ellipse gives back the covariance that it is of
+    a, b, azimuth = images[["ellipse_a_m", "ellipse_b_m", "ellipse_azimuth_deg"]].to_numpy().T
+    along = np.stack([np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth))], axis=1)
+    across = along[:, ::-1] * [1, -1]
+    again = np.einsum("n,ni,nj->nij", a**2, along, along) + np.einsum("n,ni,nj->nij", b**2, across, across)
+    np.testing.assert_allclose(again, found.covariance.centers[:, :2, :2], rtol=1e-6, atol=1e-12)
     with pytest.raises(JaxbaError, match="no prior 'attitude'; it has position, control"):
         found.prior_frame("attitude")
 

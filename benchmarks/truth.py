@@ -7,8 +7,8 @@ survey: their RMS over sigma differs from 1 by chance far more than their number
 
 - Positions: of the cameras, an axis; what they have in common in a line of its own.
 - Points: height over the true terrain, along its normal.
-- Focal length, principal point, distortion: against the lens; `rays`: how far its image of a grid of directions lies
-  from the true one, px, the rotation that fits best taken out.
+- Focal length, principal point, distortion: against the lens, and over several seeds whether they are off the same way;
+  `rays`: how far its image of a grid of directions lies from the true one, px, the rotation that fits best taken out.
 - Check points: the surveyor's marks triangulated in the adjusted block, against true coordinates in the target CRS.
   Their sigmas are those of the marks and, as the block's share, those of tie points around with four views or more.
 """
@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,6 +41,7 @@ from jaxba.simulation._survey import survey_frame
 
 ROOT = Path(__file__).parents[1]
 _MARK_STD_PX, _NEAR, _LEAST_VIEWS = 0.3, 20, 4
+_INTRINSICS = {"focal length": ("fx", "fy"), "principal point": ("cx", "cy"), "distortion": ("k1", "k2", "p1", "p2")}
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.cores])
+    off = []
     for seed in options.seeds:
         with tempfile.TemporaryDirectory() as folder:
             survey, project = Path(folder) / "survey", Path(folder) / "project"
@@ -97,7 +99,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
             subprocess.run([*jaxba, *run, "--crs", "EPSG:32615"], cwd=ROOT, check=True, capture_output=True)
             seconds = time.perf_counter() - begun
             print(f"Seed {seed}, GNSS {' and '.join(options.gnss_std)} m: {seconds:.0f} s in all\n")
-            print(markdown(compare(survey, project)), end="\n\n", flush=True)
+            figures = compare(survey, project)
+            print(markdown(figures), end="\n\n", flush=True)
+            off.append({figure.name: figure.over_sigma for figure in figures if figure.name in _INTRINSICS})
+    if len(off) > 1:
+        print(over_seeds(off))
+
+
+def over_seeds(off: Sequence[Mapping[str, Float[np.ndarray, "*n"]]]) -> str:
+    """Return a table of the intrinsics' errors over their sigmas in several surveys: their mean, which tells a bias."""
+    lines = ["| parameter | mean error over sigma | expected | RMS over sigma |", "| --- | --- | --- | --- |"]
+    for name, members in _INTRINSICS.items():
+        values = np.array([one[name] for one in off])
+        for k, member in enumerate(members):
+            rms = np.sqrt(np.mean(values[:, k] ** 2))
+            lines.append(f"| {member} | {values[:, k].mean():+.2f} | 0 +- {len(off) ** -0.5:.2f} | {rms:.2f} |")
+    return "\n".join(lines)
 
 
 def markdown(figures: Sequence[Figure]) -> str:
@@ -170,9 +187,8 @@ def _camera(found: adjust.Outputs, truth: dict[str, np.ndarray]) -> list[Figure]
     own = CAMERAS[found.block.camera_model].parameter_names()
     error = found.block.camera_parameters[0] - truth["camera_parameters"][[names.index(name) for name in own]]
     std = found.intrinsics_std[0]
-    groups = {"focal length": ("fx", "fy"), "principal point": ("cx", "cy"), "distortion": ("k1", "k2", "p1", "p2")}
     figures = []
-    for name, members in groups.items():
+    for name, members in _INTRINSICS.items():
         index = [own.index(member) for member in members]
         figures.append(Figure(name, "" if name == "distortion" else "px", error[index], std[index]))
     model = CAMERAS["OPENCV"]

@@ -165,7 +165,7 @@ _REASONS: dict[str, Callable[..., str]] = {
     ),
     "survey scatters": lambda times: (
         f"control points scatter by {times:g} times their sigmas or more: that is no survey of them. Check the list's "
-        "CRS, its heights, its names and marks"
+        "CRS, its heights, its names and marks, or state what they are good to (control.std_h, control.std_v)"
     ),
     "check points shifted": lambda shift_m: (
         f"the block stands {along_axes(shift_m, '+.3f')} from where all check points say. Correct positions or control "

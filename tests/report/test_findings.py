@@ -302,7 +302,8 @@ CASES = [
         ),
         "DO NOT USE this result: most of the control points contradict the block (g1, g2). Check the list's CRS, its "
         "heights, its names and marks; control points scatter by 10 times their sigmas or more: that is no survey of "
-        "them. Check the list's CRS, its heights, its names and marks; then run again.",
+        "them. Check the list's CRS, its heights, its names and marks, or state what they are good to (control.std_h, "
+        "control.std_v); then run again.",
     ),
     (
         Finding.of(

@@ -13,6 +13,8 @@ from jaxba.sfm._measured import used_positions
 from jaxba.sfm._problem import is_collinear
 
 _OFFSET = 3.0  # sigmas of a position, after a fit
+_HEIGHT_UNITS = {"feet as metres": 0.3048, "metres as feet": 1 / 0.3048}  # true heights over those of the list
+_LEAST_FEET_M, _SAME_UNIT = 20.0, 0.03  # below it anything looks so; relative, of what the unit makes
 _MARKS_OFF = 5.0  # sigmas of a mark, in the median
 
 
@@ -34,7 +36,7 @@ def control_findings(
             *_shifted(control, fit),
             *_set_aside(control, fit, explained),
             *_suspects(control, fit),
-            *_offset(block, fit, reference, explained),
+            *_offset(block, control, fit, reference, explained),
         ]
     )
 
@@ -200,7 +202,9 @@ def _suspects(control: Control, fit: ControlFit) -> list[Finding]:
     ]
 
 
-def _offset(block: Block, fit: ControlFit, reference: Reference, explained: Explained) -> list[Finding]:
+def _offset(
+    block: Block, control: Control, fit: ControlFit, reference: Reference, explained: Explained
+) -> list[Finding]:
     """Positions that are off in common: as tests of the adjustment say, or after a fit by their sigmas."""
     offset = fit.gnss_minus_control_m
     index = block.image_index[used_positions(block, reference)]
@@ -221,5 +225,27 @@ def _offset(block: Block, fit: ControlFit, reference: Reference, explained: Expl
             offset_std_m=fit.gnss_minus_control_std_m.tolist(),
             std_m=std.tolist(),
             is_compared=fit.method == "none",
+            looks_like=_looks_like(float(offset[2]), _height_m(control, fit, reference)),
         )
     ]
+
+
+def _height_m(control: Control, fit: ControlFit, reference: Reference) -> float:
+    """Return the median height of the control points, as their list has it; NaN where none has one."""
+    used = ~control.is_check & np.isfinite(control.std_m[:, 2]) & np.isfinite(fit.adjusted_m[:, 2])
+    if reference.frame is None or not used.any():
+        return float("nan")
+    return reference.frame.height_m + float(np.median(control.xyz_m[used, 2]))
+
+
+def _looks_like(off_up_m: float, height_m: float) -> str:
+    """Return which usual mistake makes positions and control differ by so much in height; empty for none.
+
+    >>> _looks_like(250.0 - 250.0 / 0.3048, 250.0 / 0.3048)
+    'feet as metres'
+    """
+    for name, factor in _HEIGHT_UNITS.items():
+        expected_m = height_m * (factor - 1)
+        if abs(expected_m) > _LEAST_FEET_M and abs(off_up_m - expected_m) < _SAME_UNIT * abs(expected_m):
+            return name
+    return ""

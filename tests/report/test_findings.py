@@ -368,6 +368,7 @@ CASES = [
             offset_std_m=[0.02, 0.02, NAN],
             std_m=[0.03, 0.03, 0.06],
             is_compared=False,
+            looks_like="",
         ),
         "GNSS positions minus the block as control places it: east +1.50, north -2.00 m (sigma east 0.02, north 0.02 "
         "m), for all photos in common, where one position has sigmas of east 0.03, north 0.03 m; the block follows "
@@ -381,11 +382,13 @@ CASES = [
             offset_std_m=[NAN, NAN, NAN],
             std_m=[3.0, 3.0, INF],
             is_compared=True,
+            looks_like="feet as metres",
         ),
         "GNSS positions minus the block as control places it: east +1.50, north -2.00, up +31.00 m, for all photos in "
         "common, where one position has sigmas of east 3, north 3 m; compared only. Centimetres and decimetres are the "
         "antenna's offset or a base beside its mark; metres and tens of metres two datums or height systems; hundreds "
-        "a wrong zone or swapped axes of one of the two.",
+        "a wrong zone or swapped axes of one of the two. Heights of the list read feet as metres would make just this "
+        "difference.",
     ),
 ]
 

@@ -168,6 +168,10 @@ _REASONS: dict[str, Callable[..., str]] = {
         f"most of the control points contradict the block ({', '.join(names)}). Check the list's CRS, its heights, its "
         "names and marks"
     ),
+    "not settled": lambda names: (
+        f"which control points are wrong ({', '.join(names) or 'none of them'}?) depends on which hold the block. Look "
+        "at all of them, and survey more"
+    ),
     "survey scatters": lambda times: (
         f"control points scatter by {times:g} times their sigmas or more: that is no survey of them. Check the list's "
         "CRS, its heights, its names and marks, or state what they are good to (control.std_h, control.std_v)"

@@ -28,7 +28,8 @@ def control_findings(
     explained = _explained(adjusted, fit)
     return tuple(
         [
-            *_not_usable(control, fit, explained),
+            *_not_usable(control, adjusted, fit, explained),
+            *_not_tested(adjusted),
             *_unused(block, control, fit),
             *_too_few(block, control, fit, reference),
             *_wrong_marks(block, adjusted, control, fit, photos),
@@ -112,7 +113,12 @@ def _explained(adjusted: Adjusted, fit: ControlFit) -> Explained:
     return adjusted.on_control.explained
 
 
-def _not_usable(control: Control, fit: ControlFit, explained: Explained) -> list[Finding]:
+def _not_tested(adjusted: Adjusted) -> list[Finding]:
+    why_not = None if adjusted.on_control is None else adjusted.on_control.why_not
+    return [Finding.of("note", text=f"Control points were not tested. {why_not}")] if why_not else []
+
+
+def _not_usable(control: Control, adjusted: Adjusted, fit: ControlFit, explained: Explained) -> list[Finding]:
     """The verdict that a result must not be used, with its reasons."""
     reasons = []
     for mistake in explained.mistakes:
@@ -123,6 +129,9 @@ def _not_usable(control: Control, fit: ControlFit, explained: Explained) -> list
     wrong = {mistake.points[0] for mistake in explained.mistakes if mistake.kind == "point"}
     if 2 * len(wrong) > used.sum() > 1:
         reasons.append({"reason": "most are wrong", "names": [control.names[k] for k in sorted(wrong)]})
+    if adjusted.on_control is not None and not adjusted.on_control.is_settled:
+        names = [control.names[k] for k in np.flatnonzero(explained.wrong.any(axis=1))]
+        reasons.append({"reason": "not settled", "names": names})
     if max(explained.scale) >= MOST_SCALE:
         reasons.append({"reason": "survey scatters", "times": MOST_SCALE})
     if _is_shifted(fit).any():

@@ -43,13 +43,14 @@ class OnControl:
     """What came of the tests of control.
 
     - `explained`: what is wrong. `tested`: statistics of every point of `Control`. `standing`: of the last solve.
-    - `is_settled`: the tests said the same twice.
+    - `is_settled`: the tests said the same twice. `why_not`: why there were none, where there were none.
     """
 
     explained: Explained
     tested: Tested
     standing: Standing
     is_settled: bool
+    why_not: str | None = None
 
 
 def onto_control(
@@ -68,13 +69,12 @@ def onto_control(
         return solved, None
     common_std_m = common_std(solved.block, reference)
     none = Explained(control.num_points)
-    found, standing = none, None
+    found, standing, why_not = none, None, None
     for count in range(_MOST + 1):
         try:
             given = _misclosure(solved, std_px, control, standing, common_std_m, max_memory)
         except JaxbaError as error:
-            _log.info("control points are not tested: %s", error)
-            given = None
+            given, why_not = None, str(error)
         last, found = found, none if given is None else explain(given)
         settled = standing is not None and (given is None or found.same_as(last))
         if settled or count == _MOST:
@@ -87,7 +87,7 @@ def onto_control(
         solved = solve(transformed(solved.block, by), standing)
     assert standing is not None
     result = Tested.nothing(control.num_points) if given is None else control_statistics(given, found)
-    return solved, OnControl(found, result, standing, settled)
+    return solved, OnControl(found, result, standing, settled, why_not)
 
 
 def _misclosure(

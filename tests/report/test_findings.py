@@ -298,12 +298,14 @@ CASES = [
             reasons=[
                 {"reason": "most are wrong", "names": ["g1", "g2"]},
                 {"reason": "survey scatters", "times": 10.0},
+                {"reason": "not settled", "names": ["g1"]},
             ],
         ),
         "DO NOT USE this result: most of the control points contradict the block (g1, g2). Check the list's CRS, its "
         "heights, its names and marks; control points scatter by 10 times their sigmas or more: that is no survey of "
         "them. Check the list's CRS, its heights, its names and marks, or state what they are good to (control.std_h, "
-        "control.std_v); then run again.",
+        "control.std_v); which control points are wrong (g1?) depends on which hold the block. Look at all of them, "
+        "and survey more; then run again.",
     ),
     (
         Finding.of(

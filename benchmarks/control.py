@@ -2,12 +2,13 @@
 
 Twelve photos with five check points and 3, 5 or 12 control points (2 cm across, 3 cm in height, marks of 0.3 px that
 nobody states), positions of an RTK receiver (2 and 4 cm) or a plain one (3 and 5 m). Errors are drawn anew for each
-survey. `--clean`: surveys without a mistake, of each kind. `--planted`: surveys of each mistake. `--only`: `faults`,
-`clean` or `power`. Prints Markdown.
+survey. `--clean`: surveys without a mistake, of each kind. `--planted`: surveys of each mistake. `--blocks`: without
+control, for coverage. `--only`: `faults`, `clean`, `power` or `coverage`. Prints Markdown.
 
 - A mistake is *named* where the findings say whose and of which kind it is, *beside* where they accuse anything else.
 - *Refused*: the verdict is that the result must not be used.
 - NSE: mean normalised squared error of cameras and of check points, over surveys that were not refused; 1 is expected.
+- *Coverage*: how often ellipsoids of 95% hold the truth, of positions, rotations, points, and the intrinsics together.
 - *Theory*: the power of Baarda's test, from the smallest error that the clean surveys say shows.
 """
 
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
 
 from jaxba import sfm
@@ -208,16 +210,61 @@ def power(draw: Draws, count: int) -> None:
                     )
 
 
+def coverage(draw: Draws, count: int) -> None:
+    """Print how often ellipsoids of 95% hold the truth, in blocks that positions alone place."""
+    print("| positions | what | number | within 95% | NSE |")
+    print("| --- | --- | --- | --- | --- |")
+    for kind in _GNSS_M:
+        squares: dict[tuple[str, int], list[np.ndarray]] = {}
+        for seed in range(count):
+            survey, _ = draw(kind, 3, 5000 + seed)
+            block = sfm.with_points(survey.block, survey.tracks, min_angle_rad=0.02, max_error_px=20.0)
+            parts = survey.tracks, survey.view_graph, survey.reference, survey.photos
+            adjusted = sfm.adjust(block, *parts, _SETTINGS)
+            for key, values in _squares(adjusted, sfm.uncertainty(adjusted, survey.reference), survey).items():
+                squares.setdefault(key, []).append(values)
+        for (name, freedom), parts in squares.items():
+            values = np.concatenate(parts)
+            held = np.mean(values < chi2.isf(0.05, freedom))
+            print(f"| {kind} | {name} | {len(values):,} | {held:.1%} | {values.mean() / freedom:.2f} |", flush=True)
+
+
+def _squares(adjusted: sfm.Adjusted, sigmas: sfm.Uncertainty, survey: Simulated) -> dict[tuple[str, int], np.ndarray]:
+    """Return squared errors over their covariances, by what they are of and their degrees of freedom."""
+    block, truth, found = adjusted.block, survey.survey.truth, sigmas.covariance
+    assert found is not None
+
+    def over(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        return np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
+
+    true = Rotation.from_quat(np.asarray(truth.poses.quaternion)[block.image_index], scalar_first=True)
+    turned = (Rotation.from_quat(block.quaternion, scalar_first=True) * true.inv()).as_rotvec()
+    points = over(block.points_m - truth.points[block.track_index], found.points[: block.num_points])
+    views = np.bincount(block.observation_point, minlength=block.num_points)
+    names = type(truth.cameras).parameter_names()
+    camera = np.array([float(np.ravel(getattr(truth.cameras, name))[0]) for name in names])
+    free = np.diagonal(found.intrinsics[0]) > 0
+    error = (block.camera_parameters[0] - camera)[None, free]
+    return {
+        ("positions", 3): over(block.centers_m - np.asarray(truth.poses.center)[block.image_index], found.centers),
+        ("rotations", 3): over(turned, found.poses[:, :3, :3]),
+        ("points of two rays", 3): points[views == 2],
+        ("points of more", 3): points[views > 2],
+        ("intrinsics together", int(free.sum())): over(error, found.intrinsics[0][np.ix_(free, free)][None]),
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clean", type=int, default=50)
     parser.add_argument("--planted", type=int, default=20)
-    parser.add_argument("--only", choices=("faults", "clean", "power"))
+    parser.add_argument("--blocks", type=int, default=200)
+    parser.add_argument("--only", choices=("faults", "clean", "power", "coverage"))
     args = parser.parse_args()
     use_compilation_cache()
     draw, begun = Draws(), time.monotonic()
     for name, table, count in (("faults", faults, args.planted), ("clean", clean, args.clean),
-                               ("power", power, args.planted)):  # fmt: skip
+                               ("power", power, args.planted), ("coverage", coverage, args.blocks)):  # fmt: skip
         if args.only in (None, name):
             print(f"\n{name}, {count} surveys of each:\n")
             table(draw, count)

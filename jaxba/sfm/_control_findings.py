@@ -6,10 +6,11 @@ from jaxtyping import Bool
 from jaxba.scene import Block, Control, ControlFit, Finding, Photo, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._control import LEAST_TO_PLACE, image_rows
-from jaxba.sfm._control_explained import MOST_SCALE, Explained, Mistake
+from jaxba.sfm._control_explained import MOST_SCALE, Explained
 from jaxba.sfm._control_fit import BLUNDER, LEAST_OF
 from jaxba.sfm._control_start import determines_tilt
 from jaxba.sfm._measured import used_positions
+from jaxba.sfm._misclosure import Mistake
 from jaxba.sfm._problem import is_collinear
 
 _OFFSET = 3.0  # sigmas of a position, after a fit

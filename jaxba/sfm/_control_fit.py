@@ -26,8 +26,8 @@ from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control, ControlFit, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._control import LEAST_TO_PLACE, Intersected, intersect
-from jaxba.sfm._control_explained import Tested
 from jaxba.sfm._control_start import determines_tilt, fit_similarity, transformed
+from jaxba.sfm._control_statistics import Tested
 from jaxba.sfm._measured import median_offset
 from jaxba.sfm._uncertainty import Uncertainty, own_variance
 

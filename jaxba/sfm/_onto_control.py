@@ -27,9 +27,11 @@ from jaxba.ba import AbstractPrior, ControlPointPrior, Problem, propagate
 from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control, Reference
 from jaxba.sfm._control import CONTROL_LOSS, Standing, after_tests
-from jaxba.sfm._control_explained import Explained, Misclosure, Tested, control_statistics, explain
+from jaxba.sfm._control_explained import Explained, explain
 from jaxba.sfm._control_start import transformed
+from jaxba.sfm._control_statistics import Tested, control_statistics
 from jaxba.sfm._measured import common_std
+from jaxba.sfm._misclosure import Misclosure
 from jaxba.sfm._rounds import Solved
 from jaxba.sfm._spread import spread, weighed
 

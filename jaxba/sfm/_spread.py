@@ -60,10 +60,11 @@ def position_spread(problem: Problem, prior: PositionPrior) -> float:
     freedom = 3 * count - 7
     if count < _LEAST_POSITIONS:
         return 1.0
-    moved = np.asarray(problem.poses.center)[prior.image_index] + np.sum(problem.position_offset, axis=0) - prior.xyz
-    squared = np.sum((moved / prior.std_m) ** 2, axis=1)
-    comparable = squared * 3 * count / freedom
     with jax.enable_x64(True):
+        center = np.asarray(problem.poses.center)[prior.image_index]
+        moved = center + np.sum(problem.position_offset, axis=0) - prior.xyz
+        squared = np.sum((moved / prior.std_m) ** 2, axis=1)
+        comparable = squared * 3 * count / freedom
         weight = np.asarray(prior.loss.derivatives(jnp.asarray(squared))[1])
         _, expected, change = (np.asarray(part) for part in prior.loss.derivatives(jnp.asarray(comparable)))
     slope = np.mean(expected + 2 / 3 * comparable * change)

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
 
 from jaxba import sfm
+from jaxba.ba import NONCENTRALITY
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.scene import Control, Finding
 from jaxba.simulation.staged import Simulated, measured_anew, simulate, spread_control
@@ -201,7 +202,7 @@ def power(draw: Draws, count: int) -> None:
                         found += mine in judged.accused
                         other += bool(judged.accused - {mine})
                         refused += not judged.is_usable
-                        center = (4.1319 * size_m / shown.detectable_m[row, k]) ** 2
+                        center = (NONCENTRALITY * size_m / shown.detectable_m[row, k]) ** 2
                         expected.append(ncx2.sf(chi2.isf(1e-3, freedom), freedom, center))
                     print(
                         f"| {kind} | {num_control} | {size_m} m {axis} | {found / count:.0%} | {np.mean(expected):.0%} "

@@ -86,7 +86,7 @@ class Outputs:
       the sigmas of the results allow for. `loss`, `loss_f_scale`: of the observations, its scale in those sigmas.
     - `position_scale`: factor on the sigmas of positions, an axis.
     - `pruned`: edges left out, with their figures. `solver`: why the last solve stopped, as `Solution.result` names it.
-    - `common`: what positions have in common as an unknown of the last solve; None where it was none.
+    - `common`: what positions have in common as an unknown, and its prior sigma; None where it was none.
     - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
     - `mark_std_px`: sigma of a mark that weighed them.
     - `affine`: 3 x 4, what coordinates take beside the block, of `control.method=affine`; else the identity.
@@ -198,7 +198,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         findings=found,
         pruned=adjusted.pruned,
         solver=adjusted.solution.result,
-        common=None if adjusted.on_control is None else adjusted.on_control.standing.common,
+        common=adjusted.common,
         control=controlled.fit,
         mark_used=adjusted.mark_used,
         mark_std_px=adjusted.mark_std_px,

@@ -99,17 +99,16 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         _write(folder / "cloud.png", picture)
     target_m = tuple(np.nan if value is None else value for value in (params.accuracy_h, params.accuracy_v))
     found = accuracy(inputs.control, adjusted.control, (float(target_m[0]), float(target_m[1])))
-    if found is not None:
-        notes.append(f"Accuracy: {accuracy_row(found.facts())}.")
+    stated = [] if found is None else [f"Accuracy: {accuracy_row(found.facts())}."]
     names = sorted([*(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()), _README])
-    _write(folder / _README, readme(frame, adjusted, notes, names).encode())
+    _write(folder / _README, readme(frame, adjusted, [*notes, *stated], names).encode())
     hashes = tuple(sha256(folder / name) for name in names)
     return Outputs(files=tuple(names), sha256=hashes, notes=tuple(notes), accuracy=found)
 
 
 def lines(outputs: Outputs, told: Told) -> list[str]:
     """Return what was made, in words."""
-    return [many(len(outputs.files), "file"), *(note for note in outputs.notes if not note.startswith("Accuracy:"))]
+    return [many(len(outputs.files), "file"), *outputs.notes]
 
 
 def facts(outputs: Outputs, told: Told) -> dict[str, Any]:

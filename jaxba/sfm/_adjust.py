@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from jaxba._errors import JaxbaError
 from jaxba.ba import Problem, Solution
 from jaxba.geometry import AbstractLoss
-from jaxba.scene import Block, Control, Features, LeftOut, Photo, PrunedEdge, Reference, Tracks, ViewGraph
+from jaxba.scene import Block, CommonOffset, Control, Features, LeftOut, Photo, PrunedEdge, Reference, Tracks, ViewGraph
 from jaxba.sfm._complete import complete_tracks
 from jaxba.sfm._control import ControlPart, Standing, agreeing_marks, mark_std
 from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, without_edges
@@ -79,10 +79,16 @@ class Adjusted:
     on_control: OnControl | None = None
     max_memory: float | str | None = None
 
-    @property
+    @functools.cached_property
     def spread(self) -> float:
         """Times `std_px` that the errors of observations bear on the result."""
         return spread(self.block, self.error_px, self.std_px, self.loss)
+
+    @property
+    def common(self) -> CommonOffset | None:
+        """What positions have in common as an unknown, where the last solve put it; None where it was none."""
+        common = None if self.on_control is None else self.on_control.standing.common
+        return None if common is None else CommonOffset(self.common_m, common.std_m)
 
     @property
     def num_rejected(self) -> int:
@@ -199,7 +205,7 @@ def adjust(
         return solve(block, std_px, max_nfev=settings.max_nfev, ftol=settings.ftol, standing=standing)
 
     solved, on_control = onto_control(solved, std_px, reference, control, max_memory, stand)
-    block = solved.block
+    block, medians[-1] = solved.block, float(np.median(solved.error_px))
     return Adjusted(
         block=dataclasses.replace(block, unregistered=(*block.unregistered, *lost)),
         error_px=solved.error_px,
@@ -210,7 +216,7 @@ def adjust(
         position_scale=solved.position_scale,
         num_judged=max(num_judged, block.num_observations),
         medians_px=tuple(medians),
-        converged=converged,
+        converged=converged and solved.solution.converged,
         pruned=tuple(pruned),
         lost=tuple(lost),
         notes=tuple(notes),

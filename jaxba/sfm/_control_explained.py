@@ -110,7 +110,7 @@ def _searched(model: Model) -> list[Mistake]:
 def _cost(model: Model, mistakes: list[Mistake]) -> float:
     """Return minus twice the logarithm of the likelihood, and what mistakes and enlarged sigmas cost."""
     off = model.misclosure(mistakes)
-    cost = sum(quantile(3 if m.kind == "swapped" else len(m.axes)) for m in mistakes)
+    cost = sum(quantile(mistake.freedom) for mistake in mistakes)
     cost += quantile(1) * sum(value > 1 for value in model.scale)
     return float(off @ model.left(mistakes) @ off) + model.log_size + cost
 

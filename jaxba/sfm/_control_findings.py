@@ -7,9 +7,9 @@ from jaxba.scene import Block, Control, ControlFit, Finding, Photo, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._control import LEAST_TO_PLACE, image_rows
 from jaxba.sfm._control_explained import MOST_SCALE, Explained
-from jaxba.sfm._control_fit import BLUNDER, LEAST_OF
+from jaxba.sfm._control_fit import LEAST_OF
 from jaxba.sfm._control_start import determines_tilt
-from jaxba.sfm._measured import used_positions
+from jaxba.sfm._measured import OUTLIER, used_positions
 from jaxba.sfm._misclosure import Mistake
 from jaxba.sfm._problem import is_collinear
 
@@ -148,7 +148,7 @@ def _culprit(control: Control, mistake: Mistake) -> str:
 
 def _is_shifted(fit: ControlFit) -> Bool[np.ndarray, "3"]:
     with np.errstate(invalid="ignore"):
-        return np.abs(fit.check_shift_m) > BLUNDER * fit.check_shift_std_m
+        return np.abs(fit.check_shift_m) > OUTLIER * fit.check_shift_std_m
 
 
 def _set_aside(control: Control, fit: ControlFit, explained: Explained) -> list[Finding]:
@@ -174,7 +174,7 @@ def _set_aside(control: Control, fit: ControlFit, explained: Explained) -> list[
                 off_m=[float(fit.without_m[k, axis]) if axis in axes else float("nan") for axis in range(3)],
                 std_m=[float(fit.without_std_m[k, axis]) if axis in axes else float("nan") for axis in range(3)],
                 over_sigma=float(fit.over_sigma[k]),
-                limit=BLUNDER,
+                limit=OUTLIER,
                 rivals=sorted({_culprit(control, rival) for m in mine for rival in m.rivals}),
             )
         )
@@ -205,7 +205,7 @@ def _suspects(control: Control, fit: ControlFit) -> list[Finding]:
             is_check=bool(control.is_check[k]),
             residual_m=fit.residual_m[k].tolist(),
             over_sigma=float(fit.over_sigma[k]),
-            limit=BLUNDER,
+            limit=OUTLIER,
             method=fit.method,
         )
         for k in np.flatnonzero(fit.is_suspect & ~fit.is_set_aside.any(axis=1))

@@ -28,10 +28,9 @@ from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._control import LEAST_TO_PLACE, Intersected, intersect
 from jaxba.sfm._control_start import determines_tilt, fit_similarity, transformed
 from jaxba.sfm._control_statistics import Tested
-from jaxba.sfm._measured import median_offset
+from jaxba.sfm._measured import OUTLIER, median_offset
 from jaxba.sfm._uncertainty import Uncertainty, own_variance
 
-BLUNDER = 3.29  # sigmas: one of a thousand by chance
 LEAST_OF = {"helmert": 3, "affine": 4}
 _SHEAR = 0.01
 _AROUND = 20  # tie points that tell what poses contribute to a point's sigma
@@ -92,7 +91,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
     std = np.sqrt(np.where(np.isfinite(control.std_m), control.std_m, np.nan) ** 2 + variance)
     shift, shift_std = _common(off, std, of_poses, control.is_check)
     with np.errstate(invalid="ignore"):
-        is_shifted = np.abs(shift) > BLUNDER * shift_std
+        is_shifted = np.abs(shift) > OUTLIER * shift_std
     in_common = np.where(control.is_check[:, None] & is_shifted, shift, 0.0)
     over = _largest(np.abs((off - in_common) / std))
     tests, set_aside = Tested.nothing(control.num_points), np.zeros(off.shape, bool)
@@ -110,7 +109,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
             variance[adjusted.control.rows] = np.maximum(np.einsum("nii->ni", own), 0.0)
     residual = np.where(np.isfinite(control.std_m), points - control.xyz_m, np.nan)
     with np.errstate(invalid="ignore"):
-        suspect = np.where(control.is_check | (method == "none"), over > _CHECK_OFF, over > BLUNDER) | left_out
+        suspect = np.where(control.is_check | (method == "none"), over > _CHECK_OFF, over > OUTLIER) | left_out
     if method == "adjust":
         suspect = np.where(control.is_check, suspect, set_aside.any(axis=1))
     offset = np.full(3, np.nan)
@@ -225,7 +224,7 @@ def _snooped(
         # a bent block scatters by more than marks and survey alone
         scores[rows] = _largest(over / max(float(np.nanmedian(over)) / 0.6745, 1.0))
         worst = rows[np.argmax(np.nan_to_num(scores[rows]))]
-        if not scores[worst] > BLUNDER or len(rows) <= LEAST_TO_PLACE + 1:
+        if not scores[worst] > OUTLIER or len(rows) <= LEAST_TO_PLACE + 1:
             return found, scores, left_out
         left_out[worst] = True
 

@@ -41,6 +41,7 @@ def control_statistics(given: Misclosure, explained: Explained) -> Tested:
     model = Model(given, explained.scale)
     apart = [m for m in explained.mistakes if m.kind == "common"]
     apart += _apart(explained, model)
+    placed = model.of_block + (model.common * given.common_std_m**2) @ model.common.T  # of points, without the survey
     shape = given.off_m.shape
     test, without, spread, detectable, reach = (np.full(shape, np.nan) for _ in range(5))
     for point in range(len(given.off_m)):
@@ -53,9 +54,7 @@ def control_statistics(given: Misclosure, explained: Explained) -> Tested:
                 continue
             test[point, axis] = left[row] @ model.off / np.sqrt(left[row, row])
             detectable[point, axis] = NONCENTRALITY / np.sqrt(left[row, row])
-            # C with what positions have in common
-            moves = (model.of_block + (model.common * given.common_std_m**2) @ model.common.T) @ left
-            reach[point, axis] = moves[row, row] * detectable[point, axis]
+            reach[point, axis] = placed[row] @ left[:, row] * detectable[point, axis]
         rows = model.row[point, axes]
         others = [m for m in apart if m.points != (point,)]
         left = model.left(others)

@@ -12,10 +12,10 @@ from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Finding, Photo, Reference, described
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._intrinsics import intrinsics_at_bounds, natural_intrinsics
-from jaxba.sfm._measured import OUTLIER, PLAIN_M, robust_limit, used_positions
+from jaxba.sfm._measured import BY_CHANCE, OUTLIER, PLAIN_M, robust_limit, used_positions
 from jaxba.sfm._uncertainty import Uncertainty
 
-_SCATTER, _SIGNIFICANCE = 1.5, 1e-3
+_SCATTER = 1.5
 _WEAK_OBSERVATIONS = 20
 _FOCAL_OFF = 0.05  # from the photos' focal length
 _CENTER_OFF = 0.03  # of the width
@@ -186,7 +186,7 @@ def _scatter(adjusted: Adjusted, reference: Reference, fit: GnssFit) -> list[Fin
     ratio = np.where(fit.is_outlier[:, None], np.nan, (fit.residual_m - fit.middle_m) / reference.std_m[index])
     known = np.count_nonzero(np.isfinite(ratio), axis=0)
     # the quantile of chi-square; `scipy.stats`, which has it by name, takes 0.5 s to import
-    by_chance = 2 * gammaincinv(np.maximum(known, 1) / 2, 1 - _SIGNIFICANCE)
+    by_chance = 2 * gammaincinv(np.maximum(known, 1) / 2, 1 - BY_CHANCE)
     excess = (adjusted.position_scale >= _SCATTER) & (fit.scale_m >= _SCATTER * stated)
     excess &= np.nansum(ratio**2, axis=0) > by_chance
     if not excess.any():

@@ -15,7 +15,8 @@ OUTLIER = 3.29
 _FREEDOM = 0.45  # times n: of Student's t that the residuals of n values over their robust sigma follow (simulated)
 _LEAST_TO_SCATTER = 6  # positions
 _LEAST_SCATTER = 0.1  # of a plain receiver's sigma, most of which its positions have in common
-_BY_CHANCE = 1e-3
+BY_CHANCE = 1e-3
+"""Level of tests."""
 _LEAST_COMMON = 0.1  # of a good position's sigma: what all of them have in common, unless control tells it
 
 
@@ -71,7 +72,7 @@ def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]
         shown = np.sqrt(total / freedom)
         if np.median(std[known]) > PLAIN_M:
             scale[axis] = max(shown, _LEAST_SCATTER)
-        elif shown > 1 and chdtrc(freedom, total) < _BY_CHANCE:
+        elif shown > 1 and chdtrc(freedom, total) < BY_CHANCE:
             scale[axis] = shown
     return scale
 

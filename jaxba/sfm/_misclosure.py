@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri
 
-SIGNIFICANCE = 1e-3
+from jaxba.sfm._measured import BY_CHANCE
+
 UNSEEN = 1e-6
 """Of a column's own weight, that is left where others take it up."""
 _GROUPS = ((2,), (0, 1))  # axes that a mistake is in: height, across
@@ -47,6 +48,11 @@ class Mistake:
     gain: float = 0.0
     over: float = 0.0
     rivals: tuple["Mistake", ...] = ()
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom that it counts for."""
+        return 3 if self.kind == "swapped" else len(self.axes)
 
     @property
     def culprit(self) -> tuple[str, tuple[int, ...]]:
@@ -154,7 +160,7 @@ class Model:
         for mistake in found:
             gain = self.gain(mistake, left, left_off)
             if gain is not None:
-                tried.append(replace(mistake, gain=gain, over=gain - quantile(len(mistake.axes))))
+                tried.append(replace(mistake, gain=gain, over=gain - quantile(mistake.freedom)))
         doubtful = sorted({t.points[0] for t in tried if t.kind == "point" and t.over > 0})
         for first, second in combinations(doubtful, 2):
             known = self.known[first]
@@ -163,10 +169,11 @@ class Model:
             change = self.exchange(first, second)
             gain = -float(2 * change @ left_off + change @ left @ change)
             axes = tuple(int(axis) for axis in np.flatnonzero(known))
-            tried.append(Mistake("swapped", (first, second), axes, gain, gain - quantile(3)))
+            swapped = Mistake("swapped", (first, second), axes, gain)
+            tried.append(replace(swapped, over=gain - quantile(swapped.freedom)))
         return tried
 
 
 def quantile(freedom: int) -> float:
     """Return what a test of so many degrees of freedom exceeds by chance in one of a thousand."""
-    return float(chdtri(freedom, SIGNIFICANCE))
+    return float(chdtri(freedom, BY_CHANCE))

@@ -75,6 +75,7 @@ def onto_control(
     for count in range(_MOST + 1):
         try:
             given = _misclosure(solved, std_px, control, standing, common_std_m, max_memory)
+            why_not = None
         except JaxbaError as error:
             given, why_not = None, str(error)
         last, found = found, none if given is None else explain(given)

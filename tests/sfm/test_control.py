@@ -1,6 +1,7 @@
 """Control points in the adjustment and in fits after it: against the truth, with blunders, without heights or GNSS."""
 
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from jaxba.sfm import (
     Adjusted,
     Settings,
     Uncertainty,
+    _onto_control,
     adjust,
     apply_control,
     control_findings,
@@ -24,8 +26,10 @@ from jaxba.sfm import (
     with_points,
 )
 from jaxba.sfm._control import agreeing_marks, control_part, intersect, mark_std
+from jaxba.sfm._control_explained import Explained, explain
 from jaxba.sfm._control_fit import Controlled, apply_affine, fit_affine
 from jaxba.sfm._control_start import transformed
+from jaxba.sfm._misclosure import Misclosure
 from jaxba.simulation.staged import Simulated, simulate, true_block
 
 OFFSET_M = np.array([12.0, -7.0, 31.0])
@@ -348,3 +352,27 @@ def test_reliability_of_control_is_what_a_planted_error_shows(rtk: Simulated, po
     assert not half.is_suspect.any()
     pulled = half.adjusted_m[3, 2] - clean.adjusted_m[3, 2]
     assert pulled == pytest.approx(clean.reach_m[3, 2] / 2, rel=0.05)
+
+
+@pytest.mark.parametrize(("by_m", "left"), [([0.0, 0.0, 0.0], 0.4), ([1.0, -0.8, 0.8], 0.15)])
+def test_what_photos_say_of_control_is_the_same_before_and_after_it_holds_the_block(
+    rtk: Simulated, points: Control, by_m: list[float], left: float
+) -> None:
+    """The misclosure from the solution on control, by its covariance, is that of the block which control never held.
+
+    Where positions hold the block, their robust loss is softer than the weights that the covariance has of it: a third
+    of what control moved is not taken back.
+    """
+    away = replace(rtk, reference=replace(rtk.reference, xyz_m=rtk.reference.xyz_m + np.array(by_m)))
+    seen: list[Misclosure] = []
+
+    def kept(found: Misclosure) -> Explained:
+        seen.append(found)
+        return explain(found)
+
+    with mock.patch.object(_onto_control, "explain", kept):
+        residual_m = run(away, points)[1].fit.residual_m
+    assert len(seen) >= 2
+    known = np.isfinite(seen[0].off_m)
+    back, moved_by = (seen[-1].off_m - seen[0].off_m)[known], (residual_m - seen[0].off_m)[known]
+    assert np.sqrt(np.mean(back**2)) < left * np.sqrt(np.mean(moved_by**2))

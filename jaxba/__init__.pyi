@@ -70,6 +70,7 @@ from .geometry import (
 )
 from .io import (
     read_bal as read_bal,
+    read_loss as read_loss,
     read_problem as read_problem,
     read_tile as read_tile,
     write_bal as write_bal,

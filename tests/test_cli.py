@@ -60,7 +60,29 @@ def test_defaults_and_names_are_those_of_the_python_functions():
     reject = inspect.signature(jaxba.solve_and_reject).parameters
     assert (options.mad_factor, _solve._ROUNDS) == (reject["mad_factor"].default, reject["rounds"].default)
     assert list(typing.get_args(LossName)) == list(LOSSES)
-    assert options.loss == "linear"  # `jaxba.solve(problem)` is least squares too
+    assert options.loss is None  # least squares, as in `jaxba.solve(problem)`, where the file says nothing
+
+
+def test_the_loss_is_that_of_the_options_and_else_that_of_the_file(
+    cli: Cli, tmp_path: Path, survey: jaxba.synthetic.Survey
+):
+    path = tmp_path / "tile.npz"
+    jaxba.write_tile(path, survey.problem, loss=jaxba.Barron(0.5, 2.0))
+    costs = {}
+    for given, expected in (
+        ((), jaxba.Barron(0.5, 2.0)),
+        (("--f-scale", 3), jaxba.Barron(0.5, 3.0)),
+        (("--alpha", 1), jaxba.Barron(1.0, 2.0)),
+        (("--loss", "linear"), jaxba.Linear()),
+    ):
+        told = json.loads(cli("solve", path, *given, "--max-nfev", 3, "--json")[1])
+        solved = jaxba.read_loss(tmp_path / "tile.solved.npz")
+        assert repr(solved) == repr(expected) and told["f_scale"] == expected.f_scale
+        costs[given] = told["final_cost"]
+    assert len(set(costs.values())) == 4
+    assert costs["--loss", "linear"] == float(jaxba.solve(survey.problem, max_nfev=3).final_cost)
+    found = json.loads(cli("info", path, "--json")[1])
+    assert found["loss"] == {"name": "barron", "f_scale": 2.0} and "barron of scale 2" in cli("info", path)[1]
 
 
 def test_json_tells_what_solve_returns(cli: Cli, tile: Path, survey: jaxba.synthetic.Survey):

@@ -48,6 +48,13 @@ def test_a_block_without_gauge_is_solved_all_the_same(cli: Cli, tile: Path) -> N
     out = tile.with_name("free.solved.npz")
     code, text, _ = cli("solve", free, "--statistics", "--out", out)
     assert code == 0 and out.exists() and "There are none. Statistics: problem has no gauge" in text
+    code, text, _ = cli("solve", free, "--statistics", "--datum", "inner", "--json", "--out", out)
+    found = jaxba.statistics(jaxba.read_tile(out), datum="inner")
+    told = json.loads(text)["statistics"]
+    assert code == 0 and told["redundancy"] == found.covariance.redundancy
+    assert told["variance_factor"] == pytest.approx(found.covariance.variance_factor, rel=1e-9)
+    code, _, said = cli("solve", free, "--datum", "inner")
+    assert code == 2 and "--datum inner: is that of the statistics. Add --statistics." in said
     code, text, _ = cli("solve", free, "--statistics", "--json", "--out", out)
     assert "no gauge" in json.loads(text)["statistics"]["why_not"]
 

@@ -78,6 +78,22 @@ def test_partition_writes_tiles_a_picture_and_a_table(cli: Cli, tmp_path: Path, 
     assert Path(told["picture"]).is_file()
 
 
+def test_tiles_keep_the_loss_of_the_block_and_a_batch_solves_each_under_its_own(
+    cli: Cli, tmp_path: Path, block: Problem, problems: list[Problem]
+) -> None:
+    jaxba.write_tile(tmp_path / "block.npz", block, loss=jaxba.Huber(1.5))
+    cli("partition", "block.npz", "--max-images", 9, "--overlap", 3)
+    assert {repr(jaxba.read_loss(path)) for path in (tmp_path / "tiles").glob("*.npz")} == {"Huber(f_scale=1.5)"}
+    jaxba.write_tile(tmp_path / "a.npz", problems[0])
+    jaxba.write_tile(tmp_path / "b.npz", problems[0], loss=jaxba.Cauchy(2.0))
+    _, out, _ = cli("solve", "a.npz", "b.npz", "--json")
+    first, second = json.loads(out)["files"]
+    assert [(told["loss"], told["f_scale"]) for told in (first, second)] == [("linear", 1.0), ("cauchy", 2.0)]
+    for told, loss in ((first, None), (second, jaxba.Cauchy(2.0))):
+        assert told["final_cost"] == float(jaxba.solve(problems[0], loss=loss).final_cost)
+    assert eqx.tree_equal(jaxba.read_loss(tmp_path / "b.solved.npz"), jaxba.Cauchy(2.0))
+
+
 def test_partition_takes_sizes_from_the_settings_of_the_project(cli: Cli, tmp_path: Path, block: Problem) -> None:
     # breaks where a project's own settings are not looked at, or its export is written into
     project = tmp_path / "project"

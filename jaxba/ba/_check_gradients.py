@@ -244,7 +244,9 @@ def _inputs(problem: Problem, loss: AbstractLoss) -> dict[str, _Input]:
     if not free.lever_arm and problem.prior("position") is not None:
         found["fixed lever arm"] = _Input(lambda t: t[0].lever_arm, np.full(3, _SIZE_M))
     if len(problem.position_offset) and not free.position_offset and problem.prior("position") is not None:
-        found["fixed position offset"] = _Input(lambda t: t[0].position_offset, np.full((1, 3), _SIZE_M))
+        found["fixed position offset"] = _Input(
+            lambda t: t[0].position_offset, np.full(problem.position_offset.shape, _SIZE_M)
+        )
     names, free_intrinsics = type(problem.cameras).parameter_names(), np.asarray(free.intrinsics)
     values = np.stack([np.asarray(getattr(problem.cameras, name), float) for name in names], axis=-1)
     sizes = np.array([_SIZE_PX if name in ("f", "fx", "fy", "cx", "cy") else _SIZE_SHAPE for name in names])

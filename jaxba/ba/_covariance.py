@@ -7,26 +7,29 @@ Poses are tangent steps (w in rad, v in metres) in the camera's frame, as `Pose.
 
 import dataclasses
 import os
-from typing import Any
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba._errors import JaxbaError
+from jaxba.ba._inner_constraints import free_block, of_photos_alone
 from jaxba.ba._leverage import Leverage
 from jaxba.ba._plan_shape import PlanShape, bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import rotation_matrices
 from jaxba.ba._system import own_unknowns
-from jaxba.ba._unknowns import Unknowns
+from jaxba.ba._unknowns import Unknowns, antenna_names
 from jaxba.ba._variance_factor import variance_factor
 from jaxba.ba.checks import Dropped, prepare, require_gauge
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Engine
 from jaxba.ba.tiles._inverse import Marginals, Rows, compile_marginals, marginals
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
+from jaxba.ba.tiles._right_hand_sides import solved
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
+Datum = Literal["priors", "inner"]
 _PROBING = 1e-9  # damping, relative, under which a singular system shows where it is weak
 _MAX_INFLATION = 1e13  # of a variance by the other unknowns: beyond it rounding has eaten the answer
 
@@ -39,7 +42,7 @@ class Covariance:
 
     - `poses`: tangent steps (w, v) in the camera's frame: rad and metres. `centers`: camera positions, world, m^2.
     - `intrinsics`: of each camera, in its parameters' units. `lever_arm`: camera's frame, m^2. `points`: world, m^2.
-    - `position_offset`: of the offset that measured positions share, world, m^2.
+    - `position_offset`: of the offsets that measured positions share, all of them jointly, world, m^2; of none zeros.
     - `border`: joint covariance of the shared unknowns named in `border_names`: all refined intrinsics, then lever arm
       and position offset. Where each image has its own camera, only these.
     - `variance_factor`: near 1 where the sigmas are right, under any loss; `2 cost / redundancy` under least squares,
@@ -52,7 +55,7 @@ class Covariance:
     centers: Float[np.ndarray, "images 3 3"]
     intrinsics: Float[np.ndarray, "cameras parameters parameters"]
     lever_arm: Float[np.ndarray, "3 3"]
-    position_offset: Float[np.ndarray, "3 3"]
+    position_offset: Float[np.ndarray, "offsets3 offsets3"]
     points: Float[np.ndarray, "points 3 3"]
     border: Float[np.ndarray, "border border"]
     border_names: tuple[str, ...]
@@ -72,6 +75,7 @@ def covariance(
     problem: Problem,
     *,
     loss: AbstractLoss | None = None,
+    datum: Datum = "priors",
     max_memory: float | str | None = None,
     max_observations: float = TILE_OBSERVATIONS,
     folder: str | os.PathLike[str] | None = None,
@@ -80,6 +84,8 @@ def covariance(
     """Return the covariances at the problem's present values; call it on `solution.apply(problem)`.
 
     - `loss`: as given to `solve`; rows count with the weight that it gives them (least squares if None).
+    - `datum`: what the block's place, rotation and scale are known from: `priors`, with what is held fixed, or `inner`
+      for photos alone, under inner constraints over the points, whatever priors say.
     - `max_memory`, `max_observations`, `folder`, `workers`: as in `solve_tiled`.
 
     Raises `JaxbaError` where the problem has no gauge, where something in it is not determined, and where memory or
@@ -97,19 +103,56 @@ def covariance(
         "folder": folder,
         "workers": workers,
     }
-    return marginals_at("Covariance", problem, Linear() if loss is None else loss, "none", **room)[0]
+    return marginals_at("Covariance", problem, Linear() if loss is None else loss, datum, "none", **room).covariance
 
 
-def marginals_at(
-    label: str, problem: Problem, loss: AbstractLoss, rows: Rows, **room: Any
-) -> tuple[Covariance, tuple[Leverage, ...], Int[np.ndarray, " kept"]]:
-    """Return the covariances, the leverages of the rows that are asked for, and the observations that took part.
+class At(NamedTuple):
+    """What is known at a problem's present values.
 
-    - `label`: of the function that asks, for messages. `room`: as in `covariance`, whose errors it raises.
+    - `problem`: whose priors hold it; without those of poses and points under inner constraints.
+    - `leverages`: of the rows that were asked for. `kept`: the observations that took part.
+    """
+
+    problem: Problem
+    covariance: Covariance
+    leverages: tuple[Leverage, ...]
+    kept: Int[np.ndarray, " kept"]
+
+
+def marginals_at(label: str, problem: Problem, loss: AbstractLoss, datum: Datum, rows: Rows, **room: Any) -> At:
+    """Return the covariances, and the leverages of the rows that are asked for.
+
+    - `label`: of the function that asks, for messages. `datum`, `room`: as in `covariance`, whose errors it raises.
     """
     check_loss(f"{label.lower()}: loss", loss)
+    if datum not in get_args(Datum):
+        raise JaxbaError(f"{label.lower()}: datum {datum!r}; give {' or '.join(map(repr, get_args(Datum)))}.")
+    if datum == "inner":
+        problem = of_photos_alone(label, problem)
     prepared = prepare(problem)
-    problem = prepared.problem
+    of_datum = _of_priors if datum == "priors" else _of_photos
+    found = of_datum(label, prepared.problem, loss, rows, **room)
+    losses = [loss, *(prior.loss for prior in problem.priors)]
+    defect = 0 if datum == "priors" else 7
+    of_all = _in_order(found, losses, prepared.problem, prepared.dropped, defect)
+    return At(problem, of_all, found.leverages, prepared.kept)
+
+
+def _of_photos(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, **room: Any) -> Marginals:
+    """Return the marginals under inner constraints; the reach of rows, which those would tell, is not known."""
+    block = free_block(label, problem)
+    found = _of_priors(label, block.held, loss, rows, **room)
+    unknowns = own_unknowns(block.held)
+    with opened(label.lower(), block.held, loss, **room) as engine:
+        across = solved(engine, unknowns, block.columns())
+    blocks = found.blocks.copy()
+    blocks[:, :6, :6], points = block.transformed(blocks[:, :6, :6], found.points, across)
+    leverages = tuple(of._replace(reach=np.full(of.reach.shape, np.nan)) for of in found.leverages[:-1])
+    return found._replace(blocks=blocks, points=points, squares=found.squares[:-1], leverages=leverages)
+
+
+def _of_priors(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, **room: Any) -> Marginals:
+    """Return the marginals as priors, and what is fixed, hold a problem that was checked."""
     require_gauge(problem, label)
     unknowns = own_unknowns(problem)
     with opened(label.lower(), problem, loss, inverse=True, **room) as engine:
@@ -121,8 +164,7 @@ def marginals_at(
                 f"{label}: the measurements do not determine {weakest}. Hold it fixed or add a prior; an image "
                 "needs three points or more that others see, and intrinsics need views from different heights or sides."
             )
-    losses = [loss, *(prior.loss for prior in problem.priors)]
-    return _in_order(found, losses, problem, prepared.dropped), found.leverages, prepared.kept
+    return found
 
 
 def _marginals(
@@ -135,8 +177,10 @@ def _marginals(
         return None
 
 
-def _in_order(found: Marginals, losses: list[AbstractLoss], problem: Problem, dropped: Dropped) -> Covariance:
-    """Return the covariances, zero for what is fixed."""
+def _in_order(
+    found: Marginals, losses: list[AbstractLoss], problem: Problem, dropped: Dropped, defect: int
+) -> Covariance:
+    """Return the covariances, zero for what is fixed; `defect`: directions that no measurement is to fix."""
     shape, free = bare_shape(problem), problem.free
     blocks = found.blocks
     poses = blocks[:, :6, :6] * np.asarray(free.poses)[:, None, None]
@@ -150,7 +194,7 @@ def _in_order(found: Marginals, losses: list[AbstractLoss], problem: Problem, dr
     shared_free = np.zeros(0, bool) if shape.own_cameras else free_intrinsics[:, refined].reshape(-1)
     border_free = np.append(shared_free, problem.free_antenna[: shape.antenna])
     border = found.border * np.outer(border_free, border_free)
-    antenna = np.zeros((6, 6))
+    antenna = np.zeros((3 + 3 * max(len(problem.position_offset), 1),) * 2)
     antenna[: shape.antenna, : shape.antenna] = border[num_shared:, num_shared:]
     named = [*range(num_shared), *(num_shared + np.flatnonzero(problem.free_antenna[: shape.antenna]))]
     intrinsics = np.zeros((num_cameras, len(names), len(names)))
@@ -161,7 +205,7 @@ def _in_order(found: Marginals, losses: list[AbstractLoss], problem: Problem, dr
         of_cameras = border[:num_shared, :num_shared].reshape(num_cameras, len(refined), num_cameras, len(refined))
         cameras = np.arange(num_cameras)
         intrinsics[np.ix_(cameras, refined, refined)] = of_cameras[cameras, :, cameras]
-    factor, redundancy = variance_factor(losses, found.squares, float(_num_free(problem)))
+    factor, redundancy = variance_factor(losses, found.squares, float(_num_free(problem) - defect))
     return Covariance(
         poses=poses,
         centers=centers,
@@ -182,8 +226,7 @@ def _border_names(shape: PlanShape, problem: Problem) -> tuple[str, ...]:
     cameras = 0 if shape.own_cameras else problem.num_cameras
     refined = [n for n, r in zip(names, shape.refined, strict=True) if r]
     shared = [f"camera {c} {n}" for c in range(cameras) for n in refined]
-    antenna = [f"{of} {axis}" for of in ("lever arm", "position offset") for axis in "xyz"]
-    return (*shared, *antenna[: shape.antenna])
+    return (*shared, *antenna_names(len(problem.position_offset))[: shape.antenna])
 
 
 def _num_free(problem: Problem) -> int:

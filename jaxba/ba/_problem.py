@@ -85,8 +85,8 @@ class Problem(eqx.Module):
     - `free`: what may change.
     - `lower`, `upper`: bounds on the intrinsics, infinite where there is none.
     - `image_names`: used in messages; empty, or one an image.
-    - `position_offset`: what all positions of the position prior have in common beside their errors, measured minus
-      true, metres, world: one row, where a problem has such an unknown; else none.
+    - `position_offset`: what positions of the position prior have in common beside their errors, measured minus true,
+      metres, world: a row for all of them, or one a flight (`PositionPrior.offset_index`); none without such unknowns.
 
     `Problem.build` fills in the defaults; `fix` and `bound` return changed copies.
     """

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from scipy.special import chdtrc
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._covariance import Covariance, marginals_at
+from jaxba.ba._covariance import Covariance, Datum, marginals_at
 from jaxba.ba._leverage import Leverage
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._reliability import RowStatistics, row_statistics
@@ -27,6 +27,7 @@ from jaxba.ba._tables import (
     components_table,
     images_table,
     observations_table,
+    pairs_table,
     points_table,
     prior_table,
 )
@@ -91,6 +92,10 @@ class Statistics:
         """Return the table of points, likewise."""
         return points_table(self.problem, self.covariance)
 
+    def pairs_frame(self) -> DataFrame:
+        """Return the table of pairs of images that have points in common."""
+        return pairs_table(self.problem)
+
     def cameras_frame(self) -> DataFrame:
         """Return the table of intrinsics: a row for each parameter of each camera."""
         return cameras_table(self.problem, self.covariance)
@@ -112,6 +117,7 @@ def statistics(
     problem: Problem,
     *,
     loss: AbstractLoss | None = None,
+    datum: Datum = "priors",
     max_memory: float | str | None = None,
     max_observations: float = TILE_OBSERVATIONS,
     folder: str | os.PathLike[str] | None = None,
@@ -119,7 +125,8 @@ def statistics(
 ) -> Statistics:
     """Return the statistics at the problem's present values; call it on `solution.apply(problem)`.
 
-    Arguments and errors are those of `covariance`.
+    Arguments and errors are those of `covariance`. Under inner constraints there are no priors of poses and
+    points, and no reach.
 
     >>> import jaxba
     >>> survey = jaxba.synthetic.uav_block(8)
@@ -135,7 +142,7 @@ def statistics(
         "folder": folder,
         "workers": workers,
     }
-    found, leverages, kept = marginals_at("Statistics", problem, loss, "all", **room)
+    problem, found, leverages, kept = marginals_at("Statistics", problem, loss, datum, "all", **room)
     of_observations = leverages[0]
     std_px = np.repeat(np.asarray(problem.observations.std_px, float)[:, None], 2, axis=1)
     everywhere = Leverage(*(_at(np.asarray(part), kept, problem.num_observations) for part in of_observations))
@@ -154,8 +161,8 @@ def prior_statistics(
     Arguments and errors are those of `covariance`.
     """
     loss = Linear() if loss is None else loss
-    found, leverages, _ = marginals_at("Statistics", problem, loss, "priors", max_memory=max_memory)
-    return found, _of_priors(problem, leverages)
+    of_all = marginals_at("Statistics", problem, loss, "priors", "priors", max_memory=max_memory)
+    return of_all.covariance, _of_priors(problem, of_all.leverages)
 
 
 def _of_priors(problem: Problem, leverages: Sequence[Leverage]) -> tuple[RowStatistics, ...]:

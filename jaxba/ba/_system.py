@@ -242,10 +242,12 @@ def _reordered(xp: Any, prior: AbstractPrior, rows: int, plan: Plan, dtype: Any)
         if field.name == "loss":
             changed["loss"] = _as_arrays(xp, value, dtype)
             continue
-        indexed = field.name in ranks
-        value = xp.asarray(ranks[field.name], np.int32)[value] if indexed else xp.asarray(value, dtype)
+        if value is None:
+            continue
+        is_index = field.name.endswith("_index")
+        of = np.int32 if is_index else dtype
+        value = xp.asarray(ranks[field.name], of)[value] if field.name in ranks else xp.asarray(value, of)
         count = value.shape[0]
-        fill = np.inf if field.name.startswith("std") else None if count else 0.0 if indexed else 1.0
-        of = np.int32 if indexed else dtype
+        fill = np.inf if field.name.startswith("std") else None if count else 0.0 if is_index else 1.0
         changed[field.name] = _padded(xp, value, np.arange(count), rows if has_sigmas else count, fill, of)
     return dataclasses.replace(prior, **changed)

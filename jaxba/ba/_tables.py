@@ -9,6 +9,8 @@ of `RowStatistics`.
     images, points: x_m, y_m, z_m of camera or point, std_x_m, ..., ellipse_a_m, ellipse_b_m, ellipse_azimuth_deg,
                     num_observations; images also camera and std_rot_x_rad, ... about the camera's axes
     cameras:        camera, parameter, value, std
+    pairs:          image_1, image_2, num_points, distance_m, angle_deg: of images that have points in common, the
+                    median angle at which their rays meet in these
 
 The ellipse is that of one sigma in the x-y plane (39% of a normal distribution): semi-axes, and the azimuth of the
 longer one from y (north) over x (east).
@@ -98,6 +100,35 @@ def cameras_table(problem: Problem, covariance: "Covariance") -> DataFrame:
             "parameter": np.array(names)[parameter.ravel()],
             "value": values.ravel(),
             "std": std.ravel(),
+        }
+    )
+
+
+def pairs_table(problem: Problem) -> DataFrame:
+    """Return a row for each pair of images that have points in common, by number of the first, then of the second."""
+    import pandas as pd
+
+    seen, centers = problem.observations, np.asarray(problem.poses.center)
+    order = np.lexsort((np.asarray(seen.image_index), np.asarray(seen.point_index)))
+    image, point = np.asarray(seen.image_index)[order], np.asarray(seen.point_index)[order]
+    rays = np.asarray(problem.points, float)[point] - centers[image]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    parts = []
+    for step in range(1, int(np.bincount(point).max(initial=0))):
+        first = np.flatnonzero(point[step:] == point[:-step])
+        cosine = np.sum(rays[first] * rays[first + step], axis=1)
+        angle_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        parts.append(pd.DataFrame({"one": image[first], "other": image[first + step], "angle_deg": angle_deg}))
+    none = pd.DataFrame({"one": np.zeros(0, int), "other": np.zeros(0, int), "angle_deg": np.zeros(0)})
+    found = pd.concat([none, *parts]).groupby(["one", "other"])["angle_deg"].agg(["size", "median"]).reset_index()
+    one, other = found["one"].to_numpy(), found["other"].to_numpy()
+    return pd.DataFrame(
+        {
+            "image_1": _images(problem, one),
+            "image_2": _images(problem, other),
+            "num_points": found["size"],
+            "distance_m": np.linalg.norm(centers[one] - centers[other], axis=1),
+            "angle_deg": found["median"],
         }
     )
 

@@ -21,7 +21,7 @@ class Step(eqx.Module):
 class Unknowns(eqx.Module):
     """Values of everything an adjustment may change; fields as in `Problem`, the intrinsics as one array.
 
-    `antenna`: the lever arm, then the offset that all measured positions have in common, where the problem has one.
+    `antenna`: the lever arm, then the offsets that measured positions have in common, where the problem has any.
     """
 
     poses: Pose
@@ -36,7 +36,7 @@ class Unknowns(eqx.Module):
 
     @property
     def position_offset(self) -> Float[Array | np.ndarray, "offsets 3"]:
-        """Measured minus true positions, metres, world: one row, or none where the problem has no such unknown."""
+        """Measured minus true positions, metres, world: a row an offset, none where the problem has no such unknown."""
         return self.antenna[3:].reshape(-1, 3)
 
     def retract(self, step: Step) -> "Unknowns":
@@ -47,3 +47,13 @@ class Unknowns(eqx.Module):
             self.antenna + step.antenna,
             self.points + step.points,
         )
+
+
+def antenna_names(num_offsets: int) -> list[str]:
+    """Return names for the entries of `Unknowns.antenna`; offsets are numbered where there are several.
+
+    >>> antenna_names(1)[3:], antenna_names(2)[3:5]
+    (['position offset x', 'position offset y', 'position offset z'], ['position offset 0 x', 'position offset 0 y'])
+    """
+    numbers = [""] if num_offsets == 1 else [f" {number}" for number in range(num_offsets)]
+    return [f"{of} {axis}" for of in ("lever arm", *(f"position offset{n}" for n in numbers)) for axis in "xyz"]

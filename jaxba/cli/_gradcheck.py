@@ -9,15 +9,16 @@ from jaxba.cli._options import SolveOptions
 from jaxba.cli._solve import fix, make_loss, parse_bounds
 from jaxba.cli._text import to_json
 from jaxba.engine._compile_cache import use_compilation_cache
-from jaxba.io import read_problem
+from jaxba.io import problem_of_bytes, read_bytes
 
 OVER = 1
 
 
 def run(file: Path, options: SolveOptions, *, tolerance: float, seed: int) -> int:
     """Check the gradients of the problem in a file and print them; return the exit code."""
-    loss, bounds = make_loss(options), parse_bounds(options.bounds)
-    problem = fix(read_problem(file), options.fix).bound(**bounds)
+    bounds = parse_bounds(options.bounds)
+    held = problem_of_bytes(read_bytes(file), str(file))
+    loss, problem = make_loss(options, held.loss), fix(held.problem, options.fix).bound(**bounds)
     use_compilation_cache()
     checked = check_gradients(problem, loss=loss, tolerance=tolerance, seed=seed, progress=_say if _watched() else None)
     if options.json:

@@ -10,11 +10,11 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from jaxba.ba import AbstractPrior, Prepared, Problem, Unknowns, free_gauge, prepare, quality
-from jaxba.cli._result import intrinsics
+from jaxba.cli._result import intrinsics, name_of_loss
 from jaxba.cli._text import first_of, gauge_text, many, table, to_json
 from jaxba.engine._compile_cache import use_compilation_cache
-from jaxba.geometry import CAMERAS, LOSSES
-from jaxba.io import read_problem
+from jaxba.geometry import CAMERAS
+from jaxba.io import problem_of_bytes, read_bytes
 
 _BAR = 40  # characters of the longest bar of the histogram
 _LONGEST = 12  # tracks of this length and more share the histogram's last line
@@ -22,9 +22,10 @@ _LONGEST = 12  # tracks of this length and more share the histogram's last line
 
 def run(file: Path, *, as_json: bool) -> int:
     """Print what a file holds; return the exit code."""
-    problem = read_problem(file)
+    held = problem_of_bytes(read_bytes(file), str(file))
     use_compilation_cache()
-    found = {"input": str(file), **facts(problem)}
+    loss = None if held.loss is None else {"name": name_of_loss(held.loss), "f_scale": float(held.loss.f_scale)}
+    found = {"input": str(file), **facts(held.problem), "loss": loss}
     print(to_json(found) if as_json else text(found))
     return 0
 
@@ -134,6 +135,10 @@ def text(found: dict[str, Any]) -> str:
             ("free", _free_text(found)),
             ("bounds", [f"{n} {b['lower']:.6g} to {b['upper']:.6g}" for n, b in found["bounds"].items()]),
             ("priors", [_prior_text(prior) for prior in found["priors"]] or "none"),
+            (
+                "loss",
+                "{name} of scale {f_scale:.4g}, that of the file".format(**found["loss"]) if found["loss"] else [],
+            ),
             ("left out", found["dropped"]),
             ("cost", ", ".join(f"{name} {cost:.6g}" for name, cost in found["initial_costs"].items())),
             ("errors", f"median {found['median_error_px']:.3f} px, MAD {found['mad_px']:.3f} px at the start values"),
@@ -149,8 +154,7 @@ def _prior_facts(prior: AbstractPrior) -> dict[str, Any]:
         name: [float(np.median(c[np.isfinite(c)])) if np.isfinite(c).any() else np.nan for c in value.T]
         for name, value in sigmas.items()
     }
-    loss = next(name for name, cls in LOSSES.items() if isinstance(prior.loss, cls))
-    return {"name": prior.name, "rows": rows, "loss": loss, "median_std": medians}
+    return {"name": prior.name, "rows": rows, "loss": name_of_loss(prior.loss), "median_std": medians}
 
 
 def _prior_text(prior: dict[str, Any]) -> str:

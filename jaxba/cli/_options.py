@@ -35,10 +35,15 @@ def print_error(message: str, code: int) -> None:
 class SolveOptions:
     """What `solve` takes beside its file; the help texts say what each is."""
 
-    loss: Annotated[LossName, Parameter(help="Robust loss of the reprojections.")] = "linear"
-    f_scale: Annotated[float, Parameter(help="Where the loss turns robust, in sigmas of a pixel; linear has none.")] = (
-        1.0
-    )
+    loss: Annotated[
+        LossName | None, Parameter(help="Robust loss of the reprojections. [default: the file's own, else linear]")
+    ] = None
+    f_scale: Annotated[
+        float | None,
+        Parameter(
+            help="Where the loss turns robust, in sigmas of a pixel; linear has none. [default: the file's own, else 1]"
+        ),
+    ] = None
     alpha: Annotated[float | None, Parameter(help="Shape of the barron loss: 2 least squares, lower is stronger.")] = (
         None
     )
@@ -98,6 +103,13 @@ class SolveOptions:
             help="After the solve: variance components, tests of all measurements, correlations of the intrinsics.",
         ),
     ] = False
+    datum: Annotated[
+        Literal["priors", "inner"],
+        Parameter(
+            help="What --statistics takes a block's place from: its priors and what is fixed, or inner constraints over "
+            "the points, under which sigmas are those of the photos alone."
+        ),
+    ] = "priors"
     estimate_weights: Annotated[
         bool,
         Parameter(

@@ -12,7 +12,7 @@ from jaxba.cli._settings import configured
 from jaxba.cli._solve import default_output, tile_of
 from jaxba.cli._text import first_of, many, table, to_json
 from jaxba.engine._project import EXPORT, is_project
-from jaxba.io import read_problem, solved_before, write_tiles
+from jaxba.io import problem_of_bytes, read_bytes, solved_before, write_tiles
 from jaxba.pipeline import PIPELINE, Tiles
 from jaxba.report import draw_tiles, project_settings
 
@@ -43,14 +43,15 @@ def run(
         max_observations = settings.max_observations
         max_images = settings.chunk_size if max_observations is None else None
     out = default_output(file).parent / _FOLDER if out is None else out
+    held = problem_of_bytes(read_bytes(file), str(file))
     found = partition(
-        read_problem(file),
+        held.problem,
         max_observations=max_observations,
         max_images=max_images,
         by=by or settings.by,  # pyright: ignore[reportArgumentType]
         overlap=settings.overlap if overlap is None else overlap,
     )
-    paths = write_tiles(out, found, source=file)
+    paths = write_tiles(out, found, loss=held.loss, source=file)
     told = {
         "input": str(file),
         "by": by or settings.by,

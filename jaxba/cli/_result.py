@@ -12,7 +12,7 @@ from jaxba.ba import Problem, Rejected, Report, Reweighted, Statistics
 from jaxba.cli._options import SolveOptions
 from jaxba.cli._statistics import statistics_facts, statistics_rows, weights_facts, weights_rows
 from jaxba.cli._text import first_of, gauge_text, many, table
-from jaxba.geometry import AbstractLoss, Linear
+from jaxba.geometry import LOSSES, AbstractLoss, Linear
 
 _HEAVY_TAIL = 3.0  # rms over median of the errors; 1.2 without outliers, 8 with 2% of them under least squares
 _LARGE_MEDIAN_PX = 3.0
@@ -47,6 +47,11 @@ class Run:
         return report
 
 
+def name_of_loss(loss: AbstractLoss) -> str:
+    """Return the name of a loss in options and files."""
+    return next(name for name, kind in LOSSES.items() if type(loss) is kind)
+
+
 def facts(run: Run) -> dict[str, object]:
     """Return everything about a run by name, for `--json`.
 
@@ -65,8 +70,8 @@ def facts(run: Run) -> dict[str, object]:
         "final_cost": float(solution.final_cost),
         "initial_plain_cost": float(solution.initial_plain_cost),
         "final_plain_cost": float(solution.plain_cost),
-        "loss": run.options.loss,
-        "f_scale": run.options.f_scale,
+        "loss": name_of_loss(run.loss),
+        "f_scale": float(run.loss.f_scale),
         "method": run.options.method,
         "linear_solver": report.linear_solver,
         "num_steps": int(solution.num_steps),
@@ -119,7 +124,7 @@ def summary(run: Run) -> str:
     costs = f"{solution.initial_cost:.6g} -> {solution.final_cost:.6g}"
     if not isinstance(run.loss, Linear):
         plain = f"{solution.initial_plain_cost:.6g} -> {solution.plain_cost:.6g}"
-        costs = f"{costs} ({run.options.loss}; without the loss {plain})"
+        costs = f"{costs} ({name_of_loss(run.loss)}; without the loss {plain})"
     sizes = (
         many(problem.num_images, "image"),
         many(problem.num_cameras, "camera"),

@@ -7,7 +7,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +29,13 @@ from jaxba.ba import (
 )
 from jaxba.cli import _progress
 from jaxba.cli._options import INTERRUPTED, NOT_CONVERGED, SolveOptions
-from jaxba.cli._result import Run, facts, summary
+from jaxba.cli._result import Run, facts, name_of_loss, summary
 from jaxba.cli._text import to_json
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.engine._project import EXPORT, is_project
-from jaxba.geometry import LOSSES, AbstractLoss, Barron
+from jaxba.geometry import LOSSES, AbstractLoss, Barron, Linear
 from jaxba.io import (
+    Contents,
     place_of,
     problem_of_bytes,
     read_bytes,
@@ -51,12 +52,14 @@ _KINDS = ("intrinsics", "poses", "points")
 
 def run(file: Path, options: SolveOptions) -> int:
     """Adjust the problem in a file, write the result, print it; return the exit code."""
-    loss, bounds = make_loss(options), parse_bounds(options.bounds)
+    bounds = parse_bounds(options.bounds)
+    check_loss_options(options)
     check_numbers(options)
     file = tile_of(file)
     out = options.out or default_output(file)
     refuse_same_file(file, out)
-    given, extras = problem_of_bytes(read_bytes(file), str(file))
+    held = problem_of_bytes(read_bytes(file), str(file))
+    given, loss = held.problem, make_loss(options, held.loss)
     problem = fix(given, options.fix).bound(**bounds)
     _check_output(out, given)
     use_compilation_cache()
@@ -69,7 +72,7 @@ def run(file: Path, options: SolveOptions) -> int:
     problem = problem if weights is None else weights.problem
     found = _adjust(problem, loss, options, standing)
     seconds = time.perf_counter() - begin
-    _write(out, given, problem, found, extras)
+    _write(out, problem, found, loss, held)
     told = _statistics(problem, found, loss, options)
     done = Run(file, out, given, problem, found, loss, options, seconds, told, weights)
     if options.json:
@@ -112,21 +115,37 @@ def tile_of(file: Path) -> Path:
     return tile
 
 
-def make_loss(options: SolveOptions) -> AbstractLoss:
-    """Return the loss that was asked for.
+def make_loss(options: SolveOptions, own: AbstractLoss | None = None) -> AbstractLoss:
+    """Return the loss that was asked for, and where nothing was, that of the file.
 
     Raises:
         JaxbaError: a scale that is not positive, or a shape for a loss that has none.
     """
-    if not 0 < options.f_scale < math.inf:
-        raise JaxbaError(f"--f-scale {options.f_scale:g}: give a positive number, such as 1.")
+    check_loss_options(options)
+    loss = own or Linear()
+    if options.loss is not None:
+        loss = LOSSES[options.loss](f_scale=1.0)
+    if options.f_scale is not None:
+        loss = dataclasses.replace(loss, f_scale=options.f_scale)
     if options.alpha is None:
-        return LOSSES[options.loss](f_scale=options.f_scale)
-    if options.loss != "barron":
-        raise JaxbaError(f"--alpha {options.alpha:g}: only --loss barron has a shape; this is --loss {options.loss}.")
-    if math.isnan(options.alpha) or options.alpha > 2:
+        return loss
+    if not isinstance(loss, Barron):
+        raise _without_shape(options.alpha, name_of_loss(loss))
+    return dataclasses.replace(loss, alpha=options.alpha)
+
+
+def check_loss_options(options: SolveOptions) -> None:
+    """Raise `JaxbaError` for what no loss has, before a file is read."""
+    if options.f_scale is not None and not 0 < options.f_scale < math.inf:
+        raise JaxbaError(f"--f-scale {options.f_scale:g}: give a positive number, such as 1.")
+    if options.alpha is not None and not options.alpha <= 2:
         raise JaxbaError(f"--alpha {options.alpha:g}: give 2 (least squares) or less.")
-    return Barron(alpha=options.alpha, f_scale=options.f_scale)
+    if options.alpha is not None and options.loss not in (None, "barron"):
+        raise _without_shape(options.alpha, options.loss)
+
+
+def _without_shape(alpha: float, loss: str) -> JaxbaError:
+    return JaxbaError(f"--alpha {alpha:g}: only --loss barron has a shape; this is --loss {loss}.")
 
 
 def parse_bounds(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -200,6 +219,8 @@ def check_numbers(options: SolveOptions) -> None:
     if options.tiled and (options.method != "lm" or options.linear_solver != "auto"):
         given = f"--method {options.method}" if options.method != "lm" else f"--linear-solver {options.linear_solver}"
         raise JaxbaError(f"{given}: --tiled solves by Levenberg-Marquardt on its own tree alone; leave it out.")
+    if options.datum != "priors" and not options.statistics:
+        raise JaxbaError(f"--datum {options.datum}: is that of the statistics. Add --statistics.")
     if options.rounds is not None and options.reject is None:
         raise JaxbaError(f"--rounds {options.rounds}: rounds of what? Add --reject mad.")
     if options.rounds is not None and options.rounds < 0:
@@ -277,17 +298,17 @@ def _statistics(
         seen = jax.tree.map(lambda values: np.asarray(values)[used], adjusted.observations)
         adjusted = dataclasses.replace(adjusted, observations=seen)
     try:
-        return statistics(adjusted, loss=loss, max_memory=options.max_memory)
+        return statistics(adjusted, loss=loss, datum=options.datum, max_memory=options.max_memory)
     except JaxbaError as error:  # the solution is there and written
         return str(error)
 
 
-def _write(out: Path, given: Problem, problem: Problem, found: Rejected, extras: Mapping[str, np.ndarray]) -> None:
+def _write(out: Path, problem: Problem, found: Rejected, loss: AbstractLoss, held: Contents) -> None:
     """Write the solution: a tile, with what the options fixed and bounded, or BAL text, which has no room for that."""
     if out.name.endswith(_BAL_ENDINGS):
-        write_bal(out, found.solution.apply(given))
+        write_bal(out, found.solution.apply(held.problem))
         return
-    write_tile(out, found.solution.apply(problem), extras=place_of(extras) | judged(found))
+    write_tile(out, found.solution.apply(problem), loss=loss, extras=place_of(held.extras) | judged(found))
 
 
 def judged(found: Rejected) -> dict[str, np.ndarray]:

@@ -25,6 +25,7 @@ from jaxba.ba import Problem, Rejected, Solution, prepare, rejecting, solve_batc
 from jaxba.cli._options import BAD_INPUT, INTERRUPTED, NOT_CONVERGED, SolveOptions
 from jaxba.cli._result import Run, batch_summary, facts, hints
 from jaxba.cli._solve import (
+    check_loss_options,
     check_numbers,
     default_output,
     fix,
@@ -62,6 +63,7 @@ class _Work:
     made_from: str
     given: Problem
     problem: Problem
+    loss: AbstractLoss
     place: Mapping[str, np.ndarray]
     steps: Generator[Problem, Solution, Rejected]
     next: Problem
@@ -69,14 +71,14 @@ class _Work:
 
 def run(files: Sequence[Path], options: SolveOptions) -> int:
     """Adjust the problems in these files, write and print each as soon as it is known; return the exit code."""
-    loss = make_loss(options)
+    check_loss_options(options)
     parse_bounds(options.bounds)
     check_numbers(options)
     _refuse_for_several(options)
     outputs, passed_over = _outputs(files, options.out)
     use_compilation_cache()
     use_device(options.device)
-    batch = _Batch(outputs, loss, options)
+    batch = _Batch(outputs, options)
     begun = time.perf_counter()
     interrupted = False
     try:
@@ -105,8 +107,8 @@ def run(files: Sequence[Path], options: SolveOptions) -> int:
 class _Batch:
     """The files and what became of each, by file: its facts, or its error."""
 
-    def __init__(self, outputs: Mapping[Path, Path], loss: AbstractLoss, options: SolveOptions) -> None:
-        self.outputs, self.loss, self.options = outputs, loss, options
+    def __init__(self, outputs: Mapping[Path, Path], options: SolveOptions) -> None:
+        self.outputs, self.options = outputs, options
         self.told: dict[Path, dict[str, Any]] = {}
         self._lock = threading.Lock()  # solutions come from several threads
 
@@ -116,9 +118,9 @@ class _Batch:
         for work in self._read():
             waiting.append(work)
             if sum(work.problem.num_observations for work in waiting) >= _AT_A_TIME:
-                self._solve(waiting)
+                self._solve_all(waiting)
                 waiting = []
-        self._solve(waiting)
+        self._solve_all(waiting)
 
     def _read(self) -> Iterator[_Work]:
         """Yield what is to be solved; say of the others that they are done already, or why they cannot be solved."""
@@ -130,13 +132,24 @@ class _Batch:
                 if before.get(_FROM) == made_from:
                     self._tell(file, _facts_before(file, out, before), "done already")
                     continue
-                given, extras = problem_of_bytes(data, str(file))
-                problem = fix(given, self.options.fix).bound(**parse_bounds(self.options.bounds))
+                held = problem_of_bytes(data, str(file))
+                loss = make_loss(self.options, held.loss)
+                problem = fix(held.problem, self.options.fix).bound(**parse_bounds(self.options.bounds))
                 steps = rejecting(problem, rounds=rounds_of(self.options), mad_factor=self.options.mad_factor)
-                yield _Work(file, out, made_from, given, problem, place_of(extras), steps, next(steps))
+                yield _Work(
+                    file, out, made_from, held.problem, problem, loss, place_of(held.extras), steps, next(steps)
+                )
 
-    def _solve(self, works: Sequence[_Work]) -> None:
-        """Solve these, in rounds where observations are rejected."""
+    def _solve_all(self, works: Sequence[_Work]) -> None:
+        """Solve these, those under the same loss together."""
+        of_loss: dict[str, list[_Work]] = {}
+        for work in works:
+            of_loss.setdefault(repr(work.loss), []).append(work)
+        for alike in of_loss.values():
+            self._solve(alike, alike[0].loss)
+
+    def _solve(self, works: Sequence[_Work], loss: AbstractLoss) -> None:
+        """Solve these under one loss, in rounds where observations are rejected."""
         options = self.options
         while works:
             able = []
@@ -156,7 +169,7 @@ class _Batch:
 
             solve_batch(
                 [work.next for work in able],
-                loss=self.loss,
+                loss=loss,
                 method=options.method,
                 max_nfev=options.max_nfev,
                 ftol=options.ftol,
@@ -174,10 +187,11 @@ class _Batch:
             _RESULT: np.array(solution.result),
             _CONVERGED: np.array(solution.converged),
         }
-        write_tile(work.out, solution.apply(work.problem), extras={**work.place, **judged(found), **of_work})
+        extras = {**work.place, **judged(found), **of_work}
+        write_tile(work.out, solution.apply(work.problem), loss=work.loss, extras=extras)
         reports = [round_.report for round_ in found.solutions if round_.report is not None]
         seconds = sum(report.seconds_setup + report.seconds_compile + report.seconds_solve for report in reports)
-        done = Run(work.file, work.out, work.given, work.problem, found, self.loss, self.options, seconds)
+        done = Run(work.file, work.out, work.given, work.problem, found, work.loss, self.options, seconds)
         if self.options.json:
             told = facts(done)
         else:
@@ -273,7 +287,7 @@ def _hashed(data: bytes, options: SolveOptions) -> str:
 def _made_from(out: Path) -> dict[str, Any]:
     """Return how an earlier batch says that its result came about; nothing where there is no whole one."""
     with contextlib.suppress(JaxbaError, KeyError):
-        _, extras = problem_of_bytes(read_bytes(out), str(out))
+        extras = problem_of_bytes(read_bytes(out), str(out)).extras
         return {name: extras[name].item() for name in (_FROM, _RESULT, _CONVERGED)}
     return {}
 

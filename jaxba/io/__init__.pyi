@@ -39,7 +39,7 @@ from ._read import read_bytes as read_bytes, text_of as text_of
 from ._read_colmap import ColmapModel as ColmapModel, read_colmap_text as read_colmap_text
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
 from ._sites import SITE_COLUMNS as SITE_COLUMNS, Sites as Sites, make_sites as make_sites
-from ._tile import read_tile as read_tile, write_tile as write_tile
+from ._tile import Contents as Contents, read_loss as read_loss, read_tile as read_tile, write_tile as write_tile
 from ._tiles import (
     TileFile as TileFile,
     fingerprint_of as fingerprint_of,

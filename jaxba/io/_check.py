@@ -86,11 +86,12 @@ def _in_kind(array: np.ndarray, spec: ArraySpec, label: str) -> np.ndarray:
 
 def _check_values(array: np.ndarray, spec: ArraySpec, known: Mapping[str | int, int], label: str) -> None:
     if spec.indexes:
-        bad = np.flatnonzero((array < 0) | (array >= known[spec.indexes]))
+        count = known.get(spec.indexes, 1)  # of offsets there may be none
+        bad = np.flatnonzero((array < 0) | (array >= count))
         if bad.size:
             raise JaxbaError(
                 f"{label}: {spec.name}[{bad[0]}] is {array[bad[0]]}, but {spec.indexes} go from 0 to "
-                f"{known[spec.indexes] - 1}; correct it ({bad.size} of {array.size} are out of range)."
+                f"{count - 1}; correct it ({bad.size} of {array.size} are out of range)."
             )
     if spec.unit_norm:
         with np.errstate(over="ignore"):

@@ -2,13 +2,11 @@
 
 import os
 
-import numpy as np
-
 from jaxba.ba import Problem
 from jaxba.io._bal import bal_of_bytes
 from jaxba.io._npz import ZIP_MAGIC
 from jaxba.io._read import read_bytes
-from jaxba.io._tile import tile_of_bytes
+from jaxba.io._tile import Contents, tile_of_bytes
 
 
 def read_problem(path: str | os.PathLike[str]) -> Problem:
@@ -23,14 +21,14 @@ def read_problem(path: str | os.PathLike[str]) -> Problem:
     >>> read_problem(path).num_observations
     1
     """
-    return problem_of_bytes(read_bytes(path), os.fspath(path))[0]
+    return problem_of_bytes(read_bytes(path), os.fspath(path)).problem
 
 
-def problem_of_bytes(data: bytes, label: str) -> tuple[Problem, dict[str, np.ndarray]]:
-    """Return the problem in the bytes of a file of any format, and the extras of a tile; of BAL there are none.
+def problem_of_bytes(data: bytes, label: str) -> Contents:
+    """Return what the bytes of a file of any format hold.
 
     `label` names the file in messages. Raises `JaxbaError` as `read_problem` does.
     """
     if data.startswith(ZIP_MAGIC):
         return tile_of_bytes(data, label)
-    return bal_of_bytes(data, label), {}
+    return Contents(bal_of_bytes(data, label))

@@ -15,6 +15,7 @@ from jaxba.geometry import CAMERAS, LOSSES
 
 SCHEMA_NAME = "jaxba.tile"
 VERSION = 1
+OBSERVATION_LOSS = "observation_loss"
 EXTRA = "extra_"
 """Arrays whose names begin like this are carried by a tile and not read."""
 
@@ -109,17 +110,20 @@ SCHEMA: tuple[ArraySpec, ...] = (
         meaning="from the camera's centre to the GNSS antenna, shared by all images",
     ),
     ArraySpec(
-        name="position_offset_m", shape=(1, 3), kind="float64", unit="m", frame="world", default="",
-        meaning="what measured positions have in common beside their errors, measured minus true",
+        name="position_offset_m", shape=("offsets", 3), kind="float64", unit="m", frame="world", default="",
+        meaning="what measured positions have in common beside their errors, measured minus true: a row for all, or "
+        "one a flight",
     ),
     ArraySpec(name="image_names", shape=("images",), kind="str", default="", meaning="names for messages"),
 )  # fmt: skip
-"""The arrays of every tile; those of priors come from `prior_specs`."""
+"""The arrays of every tile; those of priors and losses come from `prior_specs` and `loss_specs`."""
 
 _PRIOR_FIELDS = {
     "xyz": ("m", "world", "measured position (position: of the antenna; control: of the point)"),
     "lever_arm_xyz": ("m", "camera", "measured lever arm"),
     "position_offset_xyz": ("m", "world", "expected offset, mostly zero"),
+    "position_offset_index": ("", "", "position offset that each row has; the first of all where it is left out"),
+    "position_offset_offset_index": ("", "", "position offset of each row; in their order where it is left out"),
     "std_m": ("m", "that of xyz", "standard deviation an axis; infinite where it is not measured"),
     "quaternion": ("1", "cam_from_world", "measured rotation, unit quaternion, scalar first"),
     "std_rad": ("rad", "camera", "standard deviation about each axis"),
@@ -131,7 +135,13 @@ _PRIOR_FIELDS = {
 
 def all_specs() -> tuple[ArraySpec, ...]:
     """Return every array that a tile may hold."""
-    return (*SCHEMA, *(spec for name in PRIORS for spec in (*prior_specs(name), *loss_specs(name))))
+    of_priors = (spec for name in PRIORS for spec in (*prior_specs(name), *loss_specs(loss_of(name))))
+    return (*SCHEMA, *loss_specs(OBSERVATION_LOSS), *of_priors)
+
+
+def loss_of(prior: str) -> str:
+    """Return the name of the array that names a prior's loss."""
+    return f"prior_{prior}_loss"
 
 
 def prior_specs(name: str) -> tuple[ArraySpec, ...]:
@@ -139,9 +149,11 @@ def prior_specs(name: str) -> tuple[ArraySpec, ...]:
     return tuple(_prior_spec(name, f) for f in dataclasses.fields(PRIORS[name]) if f.name != "loss")
 
 
-def loss_specs(name: str) -> tuple[ArraySpec, ...]:
-    """Return the arrays of one prior's loss: its name, and the parameters of all losses."""
-    prefix = f"prior_{name}_loss"
+def loss_specs(prefix: str) -> tuple[ArraySpec, ...]:
+    """Return the arrays of one loss: its name, and the parameters of all losses.
+
+    - `prefix`: the first array's name, with which those of the others begin.
+    """
     names = ", ".join(f"`{loss}`" for loss in LOSSES)
     specs = [ArraySpec(name=prefix, shape=(), kind="str", default="linear", meaning=f"robust loss, one of {names}")]
     defaults: dict[str, dict[str, Any]] = {}  # by parameter, then by loss
@@ -168,7 +180,8 @@ def schema_markdown() -> str:
     >>> print(schema_markdown().splitlines()[0])
     | array | shape | dtype | unit | frame | default | meaning |
     """
-    specs = [*SCHEMA, *(spec for name in PRIORS for spec in prior_specs(name)), *loss_specs("*")]
+    of_priors = (spec for name in PRIORS for spec in prior_specs(name))
+    specs = [*SCHEMA, *loss_specs(OBSERVATION_LOSS), *of_priors, *loss_specs(loss_of("*"))]
     rows = [(f"`{s.name}`", shape_text(s.shape), s.kind, s.unit, s.frame, _default_text(s), s.meaning) for s in specs]
     header = ("array", "shape", "dtype", "unit", "frame", "default", "meaning")
     lines = [header, ("---",) * len(header), *rows]
@@ -191,6 +204,7 @@ def _prior_spec(prior: str, field: dataclasses.Field) -> ArraySpec:
         kind=next(kind for kind in kinds if kind in annotation.dtypes),
         unit=unit,
         frame=frame,
+        default=None if field.default is dataclasses.MISSING else "",
         meaning=meaning,
         indexes=f"{stem}s" if last == "index" else "",
         unit_norm=field.name.startswith("quaternion"),

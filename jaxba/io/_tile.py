@@ -19,17 +19,32 @@ from jaxba.io._npz import read_npz, write_npz
 from jaxba.io._read import read_bytes
 from jaxba.io._schema import (
     EXTRA,
+    OBSERVATION_LOSS,
     SCHEMA,
     SCHEMA_NAME,
     VERSION,
     all_specs,
+    loss_of,
     loss_specs,
     prior_specs,
 )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Contents:
+    """What a file holds.
+
+    - `loss`: robust loss that its observations are to be adjusted under; None where it says nothing.
+    - `extras`: further arrays of a tile, by their names without `extra_`.
+    """
+
+    problem: Problem
+    loss: AbstractLoss | None = None
+    extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+
 def read_tile(path: str | os.PathLike[str]) -> Problem:
-    """Return the problem in a tile; arrays named `extra_...` are left unread.
+    """Return the problem in a tile; its loss (`read_loss`) and arrays named `extra_...` are left unread.
 
     Raises:
         JaxbaError: the file is missing, truncated or damaged; another schema or version; arrays that are missing,
@@ -46,25 +61,47 @@ def read_tile(path: str | os.PathLike[str]) -> Problem:
     >>> read_tile(path).observations.std_px.tolist()
     [1.0]
     """
-    return tile_of_bytes(read_bytes(path), os.fspath(path))[0]
+    return tile_of_bytes(read_bytes(path), os.fspath(path)).problem
 
 
-def tile_of_bytes(data: bytes, label: str) -> tuple[Problem, dict[str, np.ndarray]]:
-    """Return the problem in the bytes of a tile, and its extras by their names without `extra_`.
+def read_loss(path: str | os.PathLike[str]) -> AbstractLoss | None:
+    """Return the robust loss that a tile names for its observations, as `solve` takes it; None where it names none.
+
+    Raises `JaxbaError` as `read_tile` does.
+
+    >>> import pathlib, tempfile
+    >>> import jaxba
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "tile.npz")
+    >>> jaxba.write_tile(path, jaxba.synthetic.uav_block(8).problem, loss=jaxba.Huber(1.5))
+    >>> jaxba.read_loss(path)
+    Huber(f_scale=1.5)
+    """
+    return tile_of_bytes(read_bytes(path), os.fspath(path)).loss
+
+
+def tile_of_bytes(data: bytes, label: str) -> Contents:
+    """Return what the bytes of a tile hold.
 
     `label` names the file in messages. Raises `JaxbaError` as `read_tile` does.
     """
     arrays = read_npz(data, label)
     extras = {name.removeprefix(EXTRA): array for name, array in arrays.items() if name.startswith(EXTRA)}
-    return _problem_from_arrays(_checked(arrays, label)), extras
+    checked = _checked(arrays, label)
+    loss = _loss(OBSERVATION_LOSS, checked) if OBSERVATION_LOSS in arrays else None
+    return Contents(_problem_from_arrays(checked), loss, extras)
 
 
 def write_tile(
-    path: str | os.PathLike[str], problem: Problem, *, extras: Mapping[str, np.ndarray] | None = None
+    path: str | os.PathLike[str],
+    problem: Problem,
+    *,
+    loss: AbstractLoss | None = None,
+    extras: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Write a problem, whole or not at all; `read_tile` returns it exactly.
 
-    `extras` are further arrays for other programs, e.g. an inlier mask: each is written as `extra_<name>`.
+    - `loss`: robust loss that its observations are to be adjusted under; `read_loss` returns it, `jaxba solve` uses it.
+    - `extras`: further arrays for other programs, e.g. an inlier mask: each is written as `extra_<name>`.
 
     Raises:
         JaxbaError: a camera model, prior or loss without a name in files, arrays that contradict each other, an extra
@@ -78,7 +115,7 @@ def write_tile(
     >>> write_tile(pathlib.Path(tempfile.mkdtemp(), "tile.npz"), problem)
     """
     label = os.fspath(path)
-    arrays = arrays_of(problem, label)
+    arrays = arrays_of(problem, label, loss)
     for name, extra in (extras or {}).items():
         arrays[EXTRA + name] = np.asarray(extra)
         if arrays[EXTRA + name].dtype.hasobject:
@@ -87,12 +124,12 @@ def write_tile(
         write_npz(file, arrays)
 
 
-def arrays_of(problem: Problem, label: str) -> dict[str, np.ndarray]:
+def arrays_of(problem: Problem, label: str, loss: AbstractLoss | None = None) -> dict[str, np.ndarray]:
     """Return the arrays of a problem as a tile holds them; `label` names the file, which is not written, in messages.
 
     Raises `JaxbaError` as `write_tile` does.
     """
-    arrays = _arrays_from_problem(problem, label)
+    arrays = _arrays_from_problem(problem, label, loss)
     checked = _checked(arrays, f"{label}, not written")
     return {name: checked[name] for name in arrays}
 
@@ -101,9 +138,9 @@ def _checked(arrays: Mapping[str, np.ndarray], label: str) -> dict[str, np.ndarr
     """Return the arrays of a problem in the schema's types, defaults filled in, everything about them checked."""
     _check_version(arrays, label)
     check_names(arrays, label)
-    specs = list(SCHEMA)
+    specs = [*SCHEMA, *loss_specs(OBSERVATION_LOSS)]
     for name in PRIORS:
-        specs_of_prior = (*prior_specs(name), *loss_specs(name))
+        specs_of_prior = (*prior_specs(name), *loss_specs(loss_of(name)))
         if any(spec.name in arrays for spec in specs_of_prior):
             specs += specs_of_prior
     model = _choice(arrays, "camera_model", CAMERAS, label)
@@ -115,16 +152,18 @@ def _checked(arrays: Mapping[str, np.ndarray], label: str) -> dict[str, np.ndarr
             "of camera_parameters, or add zeros for those that are missing."
         )
     checked = check_arrays(arrays, specs, {"parameters": len(names)}, label)
-    for name in (name for name in PRIORS if f"prior_{name}_loss" in checked):
-        loss = _choice(checked, f"prior_{name}_loss", LOSSES, label)
+    for prefix in (OBSERVATION_LOSS, *map(loss_of, PRIORS)):
+        if prefix not in checked:
+            continue
+        loss = _choice(checked, prefix, LOSSES, label)
         parameters = _parameters(LOSSES[loss])
-        for spec in loss_specs(name)[1:]:
-            if spec.name in arrays and spec.name.removeprefix(f"prior_{name}_loss_") not in parameters:
+        for spec in loss_specs(prefix)[1:]:
+            if spec.name in arrays and spec.name.removeprefix(f"{prefix}_") not in parameters:
                 raise JaxbaError(
                     f"{label}: {spec.name} is given, but {loss} has {', '.join(parameters)} only; remove the array."
                 )
         for parameter in parameters:
-            array = f"prior_{name}_loss_{parameter}"
+            array = f"{prefix}_{parameter}"
             try:
                 check_loss("loss", LOSSES[loss](**{parameter: checked[array].item()}))
             except JaxbaError as error:
@@ -146,7 +185,7 @@ def _problem_from_arrays(a: Mapping[str, np.ndarray]) -> Problem:
             a["observation_image_index"],
             a["observation_point_index"],
         ),
-        priors=tuple(_prior(name, a) for name in PRIORS if f"prior_{name}_loss" in a),
+        priors=tuple(_prior(name, a) for name in PRIORS if loss_of(name) in a),
         lever_arm=a["lever_arm_m"],
         free=Free(**{field.name: a[f"free_{field.name}"] for field in dataclasses.fields(Free)}),
         lower=a["bounds_lower"],
@@ -185,16 +224,25 @@ def _choice(arrays: Mapping[str, np.ndarray], name: str, choices: Mapping[str, o
 
 
 def _prior(name: str, a: Mapping[str, np.ndarray]) -> AbstractPrior:
-    loss = LOSSES[a[f"prior_{name}_loss"].item()]
-    values = {spec.name.removeprefix(f"prior_{name}_"): a[spec.name] for spec in prior_specs(name)}
-    return PRIORS[name](**values, loss=loss(**{p: a[f"prior_{name}_loss_{p}"].item() for p in _parameters(loss)}))
+    values = {spec.name.removeprefix(f"prior_{name}_"): a[spec.name] for spec in prior_specs(name) if spec.name in a}
+    return PRIORS[name](**values, loss=_loss(loss_of(name), a))
+
+
+def _loss(prefix: str, a: Mapping[str, np.ndarray]) -> AbstractLoss:
+    loss = LOSSES[a[prefix].item()]
+    return loss(**{parameter: a[f"{prefix}_{parameter}"].item() for parameter in _parameters(loss)})
 
 
 def _parameters(loss: type[AbstractLoss]) -> tuple[str, ...]:
     return tuple(field.name for field in dataclasses.fields(loss))
 
 
-def _arrays_from_problem(problem: Problem, label: str) -> dict[str, np.ndarray]:
+def _loss_values(prefix: str, loss: AbstractLoss, label: str) -> dict[str, object]:
+    parameters = {f"{prefix}_{parameter}": getattr(loss, parameter) for parameter in _parameters(type(loss))}
+    return {prefix: _name_of(type(loss), LOSSES, label), **parameters}
+
+
+def _arrays_from_problem(problem: Problem, label: str, loss: AbstractLoss | None) -> dict[str, np.ndarray]:
     """Return the arrays of a problem in the schema's types and order."""
     names = type(problem.cameras).parameter_names()
     columns = [np.broadcast_to(getattr(problem.cameras, name), (problem.num_cameras,)) for name in names]
@@ -223,6 +271,8 @@ def _arrays_from_problem(problem: Problem, label: str) -> dict[str, np.ndarray]:
     }
     if len(problem.position_offset):
         values |= {"free_position_offset": free.position_offset, "position_offset_m": problem.position_offset}
+    if loss is not None:
+        values |= _loss_values(OBSERVATION_LOSS, loss, label)
     if problem.image_names:
         values["image_names"] = problem.image_names
     for prior in problem.priors:
@@ -230,10 +280,10 @@ def _arrays_from_problem(problem: Problem, label: str) -> dict[str, np.ndarray]:
         if f"{prefix}_loss" in values:
             raise JaxbaError(f"{label}: two priors named {prior.name!r}; a tile holds one, concatenate their rows.")
         for spec in prior_specs(prior.name):
-            values[spec.name] = getattr(prior, spec.name.removeprefix(f"{prefix}_"))
-        values[f"{prefix}_loss"] = _name_of(type(prior.loss), LOSSES, label)
-        for parameter in _parameters(type(prior.loss)):
-            values[f"{prefix}_loss_{parameter}"] = getattr(prior.loss, parameter)
+            value = getattr(prior, spec.name.removeprefix(f"{prefix}_"))
+            if value is not None:
+                values[spec.name] = value
+        values |= _loss_values(loss_of(prior.name), prior.loss, label)
     order = [spec.name for spec in all_specs() if spec.name in values]
     return {name: np.asarray(values[name]) for name in order}
 

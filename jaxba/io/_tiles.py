@@ -26,6 +26,7 @@ from jaxtyping import Int
 from jaxba._atomic import cannot_write, refuse_same_file
 from jaxba._errors import JaxbaError
 from jaxba.ba import BlockTile, Partition, Problem
+from jaxba.geometry import AbstractLoss
 from jaxba.io._read import read_bytes
 from jaxba.io._schema import EXTRA
 from jaxba.io._tile import arrays_of, tile_of_bytes, write_tile
@@ -59,12 +60,17 @@ class TileFile:
 
 
 def write_tiles(
-    folder: str | os.PathLike[str], partition: Partition, *, source: str | os.PathLike[str] | None = None
+    folder: str | os.PathLike[str],
+    partition: Partition,
+    *,
+    loss: AbstractLoss | None = None,
+    source: str | os.PathLike[str] | None = None,
 ) -> list[Path]:
     """Write the tiles of a partition as `tile_000.npz` and so on, each whole or not at all; return their paths.
 
-    The folder is made. Tiles that were written there before are removed first, and nothing else is. `source`, the file
-    that the block was read from, is never removed.
+    The folder is made. Tiles that were written there before are removed first, and nothing else is.
+
+    - `loss`: as of `write_tile`. `source`: the file that the block was read from, which is never removed.
 
     Raises:
         JaxbaError: the folder may not be written to, a full disk, a file in it that is called like a tile and is none
@@ -95,7 +101,7 @@ def write_tiles(
         raise cannot_write(folder, error) from error
     paths = [folder / f"tile_{number:03d}.npz" for number in range(len(places))]
     for path, tile, place in zip(paths, partition.tiles, places, strict=True):
-        write_tile(path, tile.problem, extras=place)
+        write_tile(path, tile.problem, loss=loss, extras=place)
     return paths
 
 
@@ -112,8 +118,8 @@ def read_block_tile(path: str | os.PathLike[str]) -> TileFile:
     Raises `JaxbaError` as `read_tile` does, and for a tile of no partition, or whose place contradicts its arrays.
     """
     label = os.fspath(path)
-    problem, extras = tile_of_bytes(read_bytes(path), label)
-    return _placed(Path(path), problem, extras)
+    held = tile_of_bytes(read_bytes(path), label)
+    return _placed(Path(path), held.problem, held.extras)
 
 
 def read_tiles(paths: Sequence[str | os.PathLike[str]], block: Problem | None = None) -> list[TileFile]:

@@ -227,6 +227,7 @@ def _camera_sizes(block: Block, photos: tuple[Photo, ...]) -> Int[np.ndarray, "c
 def _write_tile(inputs: Inputs) -> list[str]:
     """Write the block as a problem that `jaxba solve` takes; return what it leaves out."""
     from jaxba.ba import PRIORS
+    from jaxba.geometry import LOSSES
     from jaxba.io import write_tile
     from jaxba.sfm import control_part, to_problem, weighed
 
@@ -245,10 +246,10 @@ def _write_tile(inputs: Inputs) -> list[str]:
     problem = weighed(problem, adjusted.spread, block.num_observations)
     known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
     left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]
-    write_tile(inputs.folder / "tile.npz", dataclasses.replace(problem, priors=known))
+    loss = LOSSES[adjusted.loss](f_scale=adjusted.loss_f_scale)
+    write_tile(inputs.folder / "tile.npz", dataclasses.replace(problem, priors=known), loss=loss)
     notes = [f"tile.npz leaves out the priors that its format has no arrays for: {', '.join(left)}."] if left else []
-    scale = "" if adjusted.loss == "linear" else f" --f-scale {adjusted.loss_f_scale:.4g}"
-    notes.append(f"tile.npz has the sigmas that the results' follow from; solve it with --loss {adjusted.loss}{scale}.")
+    notes.append("tile.npz has the sigmas and the loss that the results' sigmas follow from.")
     if adjusted.control.method in ("helmert", "affine"):
         notes.append(
             "tile.npz starts at the block as it was fitted to control afterwards, and holds none: solving it takes the "

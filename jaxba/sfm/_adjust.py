@@ -82,7 +82,7 @@ class Adjusted:
     @functools.cached_property
     def spread(self) -> float:
         """Times `std_px` that the errors of observations bear on the result."""
-        return spread(self.block, self.error_px, self.std_px, self.loss)
+        return spread(self.block, self.error_px, self.std_px, self.loss).scatter
 
     @property
     def common(self) -> CommonOffset | None:

@@ -7,8 +7,9 @@ say of the points is
 
     m = v + C S^-1 w v + d
 
-to first order, v being adjusted minus surveyed, C the covariance of the points without control, S that of the survey
-with the weights w that the loss left (0 where a coordinate was set aside), d what positions have in common. It goes on
+to first order, v being adjusted minus surveyed, C how far the points give way where no control holds them (the inverse
+of the normal equations with the losses' curvature), S the covariance of the survey with the weights w that the loss
+left (0 where a coordinate was set aside), d what positions have in common. It goes on
 until the tests say the same twice: a block that had to be turned or bent far by its control is judged where it lies.
 """
 
@@ -109,12 +110,17 @@ def _misclosure(
     assert part is not None
     moves = np.zeros(3) if common_std_m is None else common_std_m
     block, rows = solved.block, part.rows
-    times = spread(block, solved.error_px, std_px, solved.loss)
-    problem = weighed(solved.problem, times, block.num_observations)
-    loss = dataclasses.replace(solved.loss, f_scale=solved.loss.f_scale / times)
-    numbers = jnp.arange(len(rows)) + block.num_points
-    free = propagate(lambda p: p.points[numbers], without_control(problem), loss=loss, max_memory=max_memory)
-    covariance = free.covariance.reshape(len(rows), 3, len(rows), 3)
+    shown = spread(block, solved.error_px, std_px, solved.loss)
+
+    def of_points(*, yielding: bool) -> Float[np.ndarray, "points 3 points 3"]:
+        times = shown.yielding if yielding else shown.scatter
+        problem = without_control(weighed(solved.problem, times, block.num_observations, yielding=yielding))
+        loss = dataclasses.replace(solved.loss, f_scale=solved.loss.f_scale / times)
+        numbers = jnp.arange(len(rows)) + block.num_points
+        free = propagate(lambda p: p.points[numbers], problem, loss=loss, max_memory=max_memory)
+        return free.covariance.reshape(len(rows), 3, len(rows), 3)
+
+    covariance = of_points(yielding=False)
     off = np.full((control.num_points, 3), np.nan)
     off[rows] = np.where(np.isfinite(part.xyz_m), part.start_m - part.xyz_m, np.nan)
     off[~np.isfinite(control.std_m)] = np.nan
@@ -124,7 +130,9 @@ def _misclosure(
         with jax.enable_x64(True):
             left = np.asarray(CONTROL_LOSS.derivatives(jnp.asarray(np.sum(over**2, axis=1)))[1])
         pulls = left[:, None] * over / held
-        off[rows] += np.einsum("iajb,jb->ia", covariance, pulls) + np.where(moves > 0, solved.common_m, 0.0)
+        off[rows] += np.einsum("iajb,jb->ia", of_points(yielding=True), pulls) + np.where(
+            moves > 0, solved.common_m, 0.0
+        )
     else:
         covariance = covariance + _bent(covariance, part.start_m)
     whole = np.zeros((control.num_points, 3, control.num_points, 3))

@@ -6,6 +6,8 @@ distribution, and all of them bear on the result. An estimate that solves `sum p
 Errors cut off by a limit look narrower than they are, so it is taken as 1 at least. What cutting itself costs is not in
 it: with normal errors, poses known and 5% or 10% cut, points scatter by 1.10 or 1.17 times their variance, all of it in
 tracks that lost an observation.
+
+How far such an estimate gives way to a further measurement is another matter: by `1 / E psi'` an observation.
 """
 
 import dataclasses
@@ -22,35 +24,49 @@ from jaxba.sfm._points import redundancy_root
 
 _LEAST_REDUNDANCY = 30  # to tell how errors are spread
 _LEAST_POSITIONS = 6  # likewise
+_MOST_YIELDING = 1.5
 _MOST_SPREAD = 0.8, 1.25  # beyond that their sigmas are what is wrong, and not how they bear on the result
 
 
-def spread(block: Block, error_px: Float[np.ndarray, " observations"], std_px: float, loss: AbstractLoss) -> float:
-    """Return how many times the sigma that weighed an observation accounts for the scatter of what was estimated.
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """Multiples of the sigma that weighed an observation or position.
+
+    - `scatter`: what accounts for the scatter of what was estimated.
+    - `yielding`: what accounts for how far the estimate gives way to a further measurement.
+    """
+
+    scatter: float = 1.0
+    yielding: float = 1.0
+
+
+def spread(block: Block, error_px: Float[np.ndarray, " observations"], std_px: float, loss: AbstractLoss) -> Spread:
+    """Return how the errors of observations bear on the result under their loss.
 
     With psi(e) = w(|e|) e over all observations, in sigmas, E over both coordinates:
 
-        spread^2 = E psi^2 E w / (E psi')^2,   E psi' = E (w + |e|^2 dw/d|e|^2)
+        scatter^2 = E psi^2 E w / (E psi')^2,   yielding^2 = E w / E psi',   E psi' = E (w + |e|^2 dw/d|e|^2)
 
-    `E psi^2` is over the redundancy; psi' is taken at errors as in long tracks. It is 1 at least.
+    `E psi^2` is over the redundancy; psi' is taken at errors as in long tracks. Both are 1 at least.
     """
     error = error_px / std_px
     redundancy = 2 * block.num_observations - 3 * block.num_points - 6 * block.num_images
     if redundancy < _LEAST_REDUNDANCY:
-        return 1.0
+        return Spread()
     views = np.bincount(block.observation_point, minlength=block.num_points)
     comparable = error * redundancy_root(views)[block.observation_point]
     with jax.enable_x64(True):
         _, weight, change = (np.asarray(part) for part in loss.derivatives(jnp.asarray(comparable**2)))
     slope = np.mean(weight + comparable**2 * change)
     if slope <= 0:  # a loss that turns back, with most errors beyond its turn
-        return 1.0
+        return Spread()
     squared = np.sum((weight * error) ** 2) / redundancy
-    return float(max(np.sqrt(squared * np.mean(weight)) / slope, 1.0))
+    mean = np.mean(weight)
+    return Spread(float(max(np.sqrt(squared * mean) / slope, 1.0)), float(max(np.sqrt(mean / slope), 1.0)))
 
 
-def position_spread(problem: Problem, prior: PositionPrior) -> float:
-    """Return how many times the sigmas of positions account for what positions do to the result under their loss.
+def position_spread(problem: Problem, prior: PositionPrior) -> Spread:
+    """Return how the errors of positions bear on the result under their loss.
 
     Weights that a loss takes from positions as good as any make the covariance larger than it is: for normal errors and
     `POSITION_LOSS` by a third, where the estimate loses 6%. As in `spread`, over three coordinates a position; a block
@@ -59,26 +75,27 @@ def position_spread(problem: Problem, prior: PositionPrior) -> float:
     count = len(prior.xyz)
     freedom = 3 * count - 7
     if count < _LEAST_POSITIONS:
-        return 1.0
+        return Spread()
     with jax.enable_x64(True):
         center = np.asarray(problem.poses.center)[prior.image_index]
-        moved = center + np.sum(problem.position_offset, axis=0) - prior.xyz
+        moved = center + prior.offset(np.asarray(problem.position_offset)) - prior.xyz
         squared = np.sum((moved / prior.std_m) ** 2, axis=1)
         comparable = squared * 3 * count / freedom
         weight = np.asarray(prior.loss.derivatives(jnp.asarray(squared))[1])
         _, expected, change = (np.asarray(part) for part in prior.loss.derivatives(jnp.asarray(comparable)))
     slope = np.mean(expected + 2 / 3 * comparable * change)
     if slope <= 0:
-        return 1.0
-    found = np.sqrt(np.sum(weight**2 * squared) / freedom * np.mean(expected)) / slope
-    return float(np.clip(found, *_MOST_SPREAD))
+        return Spread()
+    mean = np.mean(expected)
+    scatter = np.clip(np.sqrt(np.sum(weight**2 * squared) / freedom * mean) / slope, *_MOST_SPREAD)
+    return Spread(float(scatter), float(np.clip(np.sqrt(mean / slope), 1.0, _MOST_YIELDING)))
 
 
-def weighed(problem: Problem, times: float, num_own: int) -> Problem:
+def weighed(problem: Problem, times: float, num_own: int, *, yielding: bool = False) -> Problem:
     """Return a problem with the sigmas of observations and positions as their errors show them.
 
     Those of its first `num_own` observations are multiplied by `times`, by which the scale of their loss is to be
-    divided; marks' stand.
+    divided; marks' stand. `yielding`: the covariance is to tell how far the block gives way.
     """
     observations = problem.observations
     std_px = np.concatenate([observations.std_px[:num_own] * times, observations.std_px[num_own:]])
@@ -86,7 +103,8 @@ def weighed(problem: Problem, times: float, num_own: int) -> Problem:
     def of(prior: AbstractPrior) -> AbstractPrior:
         if not isinstance(prior, PositionPrior) or not isinstance(prior.loss, GemanMcClure):
             return prior
-        by = position_spread(problem, prior)
+        shown = position_spread(problem, prior)
+        by = shown.yielding if yielding else shown.scatter
         std_m = np.asarray(prior.std_m) * by
         return dataclasses.replace(prior, std_m=std_m, loss=GemanMcClure(prior.loss.f_scale / by))
 

@@ -1,5 +1,7 @@
 """Small bundle adjustment problems of every camera model, with every prior."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -98,7 +100,7 @@ def small_problem(
     Each point lies in the `seen_by` nearest images but for every sixth observation; pixels have 0.5 px of noise and
     outliers 30 px. The last image has no measured height, the last camera no calibrated last parameter and the last
     control point no surveyed height. Cameras look down with any heading, tilted by 0.15 rad. Start
-    values are some sigmas off, or the truth.
+    values are some sigmas off, or the truth. `position_offset`: two, of the first and the second half of the images.
     """
     rng = np.random.default_rng(seed)
     prior_loss = Linear() if prior_loss is None else prior_loss
@@ -145,7 +147,13 @@ def small_problem(
     measured_arm = arm + 0.05 * rng.normal(size=3) * lever_arm
     every_image, every_camera = np.arange(num_images, dtype=np.int32), np.arange(num_cameras, dtype=np.int32)
     priors = [
-        PositionPrior(every_image[::-1].copy(), antennas[::-1], gnss_std_m[::-1], prior_loss),
+        PositionPrior(
+            every_image[::-1].copy(),
+            antennas[::-1],
+            gnss_std_m[::-1],
+            prior_loss,
+            (every_image[::-1] * 2 // num_images * position_offset).astype(np.int32),
+        ),
         AttitudePrior(
             with_attitude,
             gimbal.as_quat(scalar_first=True)[with_attitude],
@@ -158,7 +166,8 @@ def small_problem(
     if lever_arm:
         priors.append(LeverArmPrior(measured_arm[None], np.full((1, 3), 0.05)))
     if position_offset:
-        priors.append(PositionOffsetPrior(np.array([[0.02, -0.01, 0.03]]), np.array([[0.05, 0.06, 0.2]])))
+        expected = np.array([[0.02, -0.01, 0.03], [-0.03, 0.02, 0.01]])
+        priors.append(PositionOffsetPrior(expected, np.array([[0.05, 0.06, 0.2], [0.08, 0.05, 0.1]])))
 
     off = 0.0 if at_truth else 1.0
     start = Rotation.from_rotvec(off * 0.003 * rng.normal(size=(num_images, 3))) * attitudes
@@ -176,8 +185,22 @@ def small_problem(
     problem = eqx.tree_at(lambda p: p.free.lever_arm, problem, np.array(lever_arm))
     if not position_offset:
         return problem
-    offset = np.array([[0.01, -0.02, 0.04]]), np.array(True)
+    offset = np.array([[0.01, -0.02, 0.04], [-0.01, 0.03, 0.02]]), np.array(True)
     return eqx.tree_at(lambda p: (p.position_offset, p.free.position_offset), problem, offset)
+
+
+def two_flights(problem: Problem) -> Problem:
+    """Return a problem with one position offset with two, of the first and the second half of its images."""
+    position, offset = problem.prior("position"), problem.prior("position_offset")
+    flight = np.asarray(position.image_index) * 2 // problem.num_images
+    changed = {
+        "position": dataclasses.replace(position, offset_index=flight.astype(np.int32)),
+        "position_offset": PositionOffsetPrior(
+            np.repeat(offset.xyz, 2, axis=0), np.repeat(offset.std_m, 2, axis=0) * [[1.0], [0.5]]
+        ),
+    }
+    priors = tuple(changed.get(prior.name, prior) for prior in problem.priors)
+    return dataclasses.replace(problem, priors=priors, position_offset=np.repeat(problem.position_offset, 2, axis=0))
 
 
 def bounded(problem: Problem, half_width: float) -> Problem:

@@ -12,10 +12,11 @@ from dense_reference import Dense, loss_derivatives
 from quick_jit import quick_jit
 from scipy.optimize import brentq
 from scipy.stats import chi2
-from small_problems import one_of
+from small_problems import one_of, two_flights
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import IntrinsicsPrior, Observations, Problem, Step, covariance, solve
+from jaxba.ba import IntrinsicsPrior, Observations, Problem, Step, covariance, solve, statistics
+from jaxba.ba._unknowns import antenna_names
 from jaxba.geometry import AbstractLoss, Cauchy, Huber, Linear
 from jaxba.simulation import Survey, uav_block
 
@@ -48,7 +49,7 @@ CASES = {
         Linear(),
     ),
     "offset of positions, lever arm held": (
-        lambda: small_block(num_control=4, position_offset_m=(0.4, -0.3, 0.2), position_offset_std_m=0.5),
+        lambda: two_flights(small_block(num_control=4, position_offset_m=(0.4, -0.3, 0.2), position_offset_std_m=0.5)),
         Linear(),
     ),
     "three cameras, fixed blocks, robust": (
@@ -159,11 +160,57 @@ def test_covariances_equal_a_dense_inverse(case: str, num_tiles: int):
         assert_same(found.position_offset, dense.of(place.antenna[3:]))
     names = type(problem.cameras).parameter_names()
     by_name = {f"camera {c} {n}": p for c, row in enumerate(place.intrinsics) for n, p in zip(names, row, strict=True)}
-    names = [f"{of} {axis}" for of in ("lever arm", "position offset") for axis in "xyz"]
-    by_name |= dict(zip(names, place.antenna, strict=False))
+    by_name |= dict(zip(antenna_names(len(problem.position_offset)), place.antenna, strict=False))
     assert_same(found.border, dense.of(np.array([by_name[name] for name in found.border_names], int)))
     assert found.redundancy == dense.redundancy
     assert found.variance_factor == pytest.approx(dense.variance_factor, rel=1e-6)
+
+
+@pytest.mark.parametrize("num_tiles", [1, 3])
+def test_inner_constraints_are_those_of_a_dense_bordered_system(num_tiles: int):
+    """The reference takes the directions that are free from the null space of J^T J, and the constraints as they stand.
+
+    It breaks where priors still hold the block, a direction is missing, or constraints are over other unknowns.
+    """
+    problem = calibrated(small_block(lever_arm_std_m=0.05, num_control=4))
+    found = statistics(problem, datum="inner", max_observations=problem.num_observations / num_tiles)
+    assert [prior.name for prior in found.problem.priors] == ["intrinsics"]
+    dense = Dense(found.problem)
+    jacobian = np.concatenate([group.jacobian.reshape(-1, dense.size) for group in dense.groups()])
+    jacobian = jacobian[np.isfinite(jacobian).all(axis=1)]
+    normal = jacobian.T @ jacobian
+    unit = 1 / np.sqrt(np.diagonal(normal))
+    values, vectors = np.linalg.eigh(normal * np.outer(unit, unit))
+    assert values[6] < 1e-10 * values[7]
+    directions = unit[:, None] * vectors[:, :7]
+    images, refined = problem.num_images, int(np.count_nonzero(problem.free.intrinsics))
+    poses = np.arange(6 * images).reshape(-1, 6)
+    intrinsics = 6 * images + np.arange(refined)
+    points = np.arange(6 * images + refined, dense.size).reshape(-1, 3)
+    over_points = np.zeros_like(directions)
+    over_points[points] = directions[points]
+    bordered = np.block([[normal, over_points], [over_points.T, np.zeros((7, 7))]])
+    scale = np.append(unit, 1 / np.linalg.norm(over_points, axis=0))
+    expected = np.linalg.inv(bordered * np.outer(scale, scale)) * np.outer(scale, scale)
+    for of, index in (
+        (found.covariance.poses, poses),
+        (found.covariance.points, points),
+        (found.covariance.border[None], intrinsics[None]),
+    ):
+        blocks = expected[index[:, :, None], index[:, None]]
+        sigma = np.sqrt(np.einsum("nii->ni", blocks))
+        unit = sigma[:, :, None] * sigma[:, None]
+        np.testing.assert_allclose(of / unit, blocks / unit, rtol=0, atol=1e-8)
+    leverage = np.einsum("ni,ij,nj->n", jacobian, expected[: dense.size, : dense.size], jacobian)
+    of_pixels = 1 - leverage[: 2 * problem.num_observations]
+    np.testing.assert_allclose(found.observations.redundancy.ravel(), of_pixels, rtol=0, atol=1e-8)
+    total = sum(np.nansum(rows.redundancy) for rows in (found.observations, *found.priors))
+    assert total == pytest.approx(found.covariance.redundancy, abs=1e-6)
+
+
+def test_inner_constraints_are_refused_where_something_is_fixed():
+    with pytest.raises(JaxbaError, match='1 poses are fixed; free them, or leave the datum at "priors"'):
+        covariance(small_block().fix(poses=[3]), datum="inner")
 
 
 def with_a_fixed_point() -> Problem:

@@ -72,9 +72,16 @@ def calibration() -> IntrinsicsPrior:
     return IntrinsicsPrior(camera_index=np.zeros(1, int), parameters=np.ones((1, 4)), std=np.ones((1, 4)))
 
 
-def given(problem: Problem, *priors: object, lever_arm: bool = False, position_offset: bool = False) -> Problem:
-    free = dataclasses.replace(problem.free, lever_arm=np.array(lever_arm), position_offset=np.array(position_offset))
-    return dataclasses.replace(problem, priors=priors, free=free, position_offset=np.zeros((int(position_offset), 3)))
+def given(problem: Problem, *priors: object, lever_arm: bool = False, position_offset: int = 0) -> Problem:
+    free = dataclasses.replace(
+        problem.free, lever_arm=np.array(lever_arm), position_offset=np.array(position_offset > 0)
+    )
+    return dataclasses.replace(problem, priors=priors, free=free, position_offset=np.zeros((position_offset, 3)))
+
+
+def of_flights(prior: PositionPrior) -> PositionPrior:
+    """Every second position has the second offset."""
+    return dataclasses.replace(prior, offset_index=np.asarray(prior.image_index, np.int32) % 2)
 
 
 CASES = {
@@ -107,19 +114,27 @@ CASES = {
     "mixed sigmas": (lambda p: given(p, positions(p, std_m=1e-3), attitudes(p, range(8))), ()),
     "free lever arm": (lambda p: given(p, positions(p), lever_arm=True), ()),
     "free position offset": (
-        lambda p: given(p, positions(p), position_offset=True),
+        lambda p: given(p, positions(p), position_offset=1),
         tuple(f"translation {a} + position offset {a}" for a in "xyz"),
     ),
-    "position offset and control": (lambda p: given(p, positions(p), control(p, [3, 8, 20]), position_offset=True), ()),
+    "position offset and control": (lambda p: given(p, positions(p), control(p, [3, 8, 20]), position_offset=1), ()),
     "position offset and a control point": (
-        lambda p: given(p, positions(p), control(p, [3]), lever_arm=True, position_offset=True),
+        lambda p: given(p, positions(p), control(p, [3]), lever_arm=True, position_offset=1),
         (),
     ),
     "known position offset": (
         lambda p: given(
-            p, positions(p), PositionOffsetPrior(np.zeros((1, 3)), np.full((1, 3), 0.5)), position_offset=True
+            p, positions(p), PositionOffsetPrior(np.zeros((1, 3)), np.full((1, 3), 0.5)), position_offset=1
         ),
         (),
+    ),
+    "offsets of two flights": (
+        lambda p: given(p, of_flights(positions(p)), position_offset=2),
+        tuple(f"translation {a} + position offset 0 {a} + position offset 1 {a}" for a in "xyz"),
+    ),
+    "offset of a flight without positions": (
+        lambda p: given(p, positions(p), control(p, [3, 8, 20]), position_offset=2),
+        ("position offset 1 x", "position offset 1 y", "position offset 1 z"),
     ),
     "idle lever arm": (
         lambda p: given(p.fix(poses=[0, 7]), lever_arm=True),
@@ -139,7 +154,7 @@ def test_free_directions_are_named(case: str):
 
 def nullity(problem: Problem) -> int:
     """Count the singular directions of the dense Jacobian of everything free, written out by hand."""
-    antenna = np.repeat([problem.free.lever_arm, problem.free.position_offset], 3)
+    antenna = problem.free_antenna
     free = np.concatenate([np.repeat(problem.free.poses, 6), np.repeat(problem.free.points, 3), antenna])
     jacobian = np.concatenate([pixel_rows(problem), *(prior_rows(prior, problem) for prior in problem.priors)])[:, free]
     jacobian /= np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
@@ -156,7 +171,7 @@ def pixel_rows(problem: Problem) -> np.ndarray:
     """Derivatives of the pixels by steps (w, v) of poses, points, lever arm and offset: p' = exp(w)(R x + t) + v."""
     rotation, _ = rotation_and_centers(problem)
     rotation, seen, images = rotation.as_matrix(), problem.observations, problem.num_images
-    rows = np.zeros((len(seen.image_index), 2, images * 6 + problem.num_points * 3 + 6))
+    rows = np.zeros((len(seen.image_index), 2, images * 6 + problem.num_points * 3 + len(problem.antenna)))
     for row, i, j in zip(rows, seen.image_index, seen.point_index, strict=True):
         p = rotation[i] @ problem.points[j] + problem.poses.translation[i]
         of_p = 1000.0 / p[2] * np.array([[1, 0, -p[0] / p[2]], [0, 1, -p[1] / p[2]]])
@@ -169,7 +184,8 @@ def pixel_rows(problem: Problem) -> np.ndarray:
 def prior_rows(prior: object, problem: Problem) -> np.ndarray:
     """Derivatives of a prior's residuals by the same steps."""
     images, points = problem.num_images, problem.num_points
-    size = images * 6 + points * 3 + 6
+    arm = images * 6 + points * 3
+    size = arm + len(problem.antenna)
     if isinstance(prior, IntrinsicsPrior):
         return np.zeros((0, size))
     index = getattr(prior, "image_index", getattr(prior, "point_index", np.zeros(1, int)))
@@ -178,14 +194,19 @@ def prior_rows(prior: object, problem: Problem) -> np.ndarray:
     for row, i in zip(rows, index, strict=True):
         if isinstance(prior, PositionPrior):  # R^T (arm - t) + offset, the lever arm being zero
             assert not np.any(problem.lever_arm)
-            row[:, 6 * i + 3 : 6 * i + 6], row[:, -6:-3], row[:, -3:] = -rotation[i].T, rotation[i].T, np.eye(3)
+            row[:, 6 * i + 3 : 6 * i + 6], row[:, arm : arm + 3] = -rotation[i].T, rotation[i].T
+            if len(problem.position_offset):
+                number = 0 if prior.offset_index is None else prior.offset_index[list(prior.image_index).index(i)]
+                at = arm + 3 + 3 * number
+                row[:, at : at + 3] = np.eye(3)
         elif isinstance(prior, AttitudePrior):
             row[:, 6 * i : 6 * i + 3] = np.eye(3)
         elif isinstance(prior, ControlPointPrior):
             row[:, 6 * images + 3 * i : 6 * images + 3 * i + 3] = np.eye(3)
         else:
-            assert isinstance(prior, LeverArmPrior | PositionOffsetPrior)
-            row[:, slice(-6, -3) if isinstance(prior, LeverArmPrior) else slice(-3, None)] = np.eye(3)
+            assert isinstance(prior, LeverArmPrior | PositionOffsetPrior)  # of one row
+            at = arm + (0 if isinstance(prior, LeverArmPrior) else 3)
+            row[:, at : at + 3] = np.eye(3)
     sigma = prior.std_rad if isinstance(prior, AttitudePrior) else prior.std_m
     return (rows / sigma[:, :, None]).reshape(-1, size)
 

@@ -90,9 +90,11 @@ def test_derivatives_of_an_attitude_equal_jacfwd_from_no_turn_to_half_a_turn(ang
 def test_residuals_of_priors_equal_their_formulas():
     rotation = Rotation.from_quat(UNKNOWNS.poses.quaternion, scalar_first=True)
     position, attitude, control = (PROBLEM.prior(name) for name in ("position", "attitude", "control"))
-    centers = rotation.inv().apply(UNKNOWNS.lever_arm - UNKNOWNS.poses.translation) + UNKNOWNS.position_offset
+    centers = rotation.inv().apply(UNKNOWNS.lever_arm - UNKNOWNS.poses.translation)
+    offsets = np.asarray(UNKNOWNS.position_offset)[position.offset_index]
+    assert len(np.unique(offsets, axis=0)) == 2
     expected = {
-        "position": (centers[position.image_index] - position.xyz) / position.std_m,
+        "position": (centers[position.image_index] + offsets - position.xyz) / position.std_m,
         "attitude": (
             rotation[attitude.image_index] * Rotation.from_quat(attitude.quaternion, scalar_first=True).inv()
         ).as_rotvec()

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_problems import two_flights
 
 import jaxba
 from jaxba import JaxbaError, Problem, Solution
@@ -38,7 +39,7 @@ def everything() -> Problem:
         position_offset_m=(0.5, -0.4, 0.3),
         position_offset_std_m=1.0,
     )
-    problem = survey.problem.bound(k1=(-0.03, 0.03))
+    problem = two_flights(survey.problem).bound(k1=(-0.03, 0.03))
     priors = [dataclasses.replace(p, loss=Cauchy(3.0)) if p.name == "position" else p for p in problem.priors]
     return eqx.tree_at(lambda p: p.priors, problem, tuple(priors))
 

@@ -93,6 +93,21 @@ def test_tables_hold_a_row_for_each_measurement() -> None:
     assert points["num_observations"].sum() == images["num_observations"].sum() == problem.num_observations
     np.testing.assert_array_equal(images["x_m"], np.asarray(found.problem.poses.center)[:, 0])
     np.testing.assert_array_equal(images["std_rot_z_rad"], np.sqrt(found.covariance.poses[:, 2, 2]))
+    pairs = found.pairs_frame()
+    sees = np.zeros((problem.num_images, problem.num_points), int)
+    sees[problem.observations.image_index, problem.observations.point_index] = 1
+    common = sees @ sees.T
+    assert [tuple(row) for row in pairs[["image_1", "image_2"]].to_numpy()] == list(
+        zip(*np.nonzero(np.triu(common, 1)), strict=True)
+    )
+    np.testing.assert_array_equal(pairs["num_points"], common[pairs["image_1"], pairs["image_2"]])
+    one, other = pairs["image_1"][5], pairs["image_2"][5]
+    centers, shared = np.asarray(found.problem.poses.center), np.flatnonzero(sees[one] & sees[other])
+    sides = [np.linalg.norm(found.problem.points[shared] - centers[k], axis=1) for k in (one, other)]
+    base = np.linalg.norm(centers[one] - centers[other])
+    angles = np.arccos((sides[0] ** 2 + sides[1] ** 2 - base**2) / (2 * sides[0] * sides[1]))
+    assert pairs["angle_deg"][5] == pytest.approx(np.degrees(np.median(angles)), rel=1e-9)
+    assert pairs["distance_m"][5] == pytest.approx(base)
     focal = cameras.set_index("parameter").loc["fx"]
     assert focal["value"] == np.ravel(found.problem.cameras.fx)[0] and focal["std"] > 0  # type: ignore[attr-defined]
     # the ellipse gives back the covariance that it is of

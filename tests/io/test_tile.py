@@ -13,10 +13,10 @@ import pytest
 from jaxba._errors import JaxbaError
 from jaxba.ba import PRIORS, Free, Observations, PositionPrior, Problem
 from jaxba.geometry import BAL, CAMERAS, LOSSES, Barron, Cauchy, Linear, Pose, SimpleRadial
-from jaxba.io import SCHEMA, read_problem, read_tile, write_bal, write_tile
+from jaxba.io import SCHEMA, read_loss, read_problem, read_tile, write_bal, write_tile
 from jaxba.io._schema import all_specs, prior_specs
 
-IMAGES, CAMERA_COUNT, POINTS, OBSERVATIONS = 4, 2, 5, 9
+IMAGES, CAMERA_COUNT, POINTS, OBSERVATIONS, OFFSETS = 4, 2, 5, 9, 2
 
 
 def unit(rng: np.random.Generator, rows: int) -> np.ndarray:
@@ -26,7 +26,7 @@ def unit(rng: np.random.Generator, rows: int) -> np.ndarray:
 
 def random_prior(name: str, parameters: int, rng: np.random.Generator):
     """A prior of any kind, by the annotations of its class alone, so that a new kind is tested by itself."""
-    sizes = {"images": IMAGES, "cameras": CAMERA_COUNT, "points": POINTS, "parameters": parameters}
+    sizes = {"images": IMAGES, "cameras": CAMERA_COUNT, "points": POINTS, "parameters": parameters, "offsets": OFFSETS}
     values = {}
     for spec in prior_specs(name):
         shape = tuple(n if isinstance(n, int) else sizes.get(n, 2) for n in spec.shape)
@@ -62,7 +62,7 @@ def random_problem(model: str = "OPENCV", priors: tuple[str, ...] = tuple(PRIORS
             np.array(True),
             np.array(True),
         ),
-        position_offset=rng.normal(size=(1, 3)),
+        position_offset=rng.normal(size=(OFFSETS, 3)),
         lower=np.where(rng.random((CAMERA_COUNT, parameters)) < 0.5, -np.inf, -9.0),
         upper=np.where(rng.random((CAMERA_COUNT, parameters)) < 0.5, np.inf, 9.0),
         image_names=tuple(f"DJI_{i}_ä.JPG" for i in range(IMAGES)),
@@ -112,6 +112,16 @@ def test_loss_reads_back_exactly(tmp_path: Path, loss: type):
     problem = eqx.tree_at(lambda p: p.priors, random_problem(priors=()), (prior,))
     write_tile(tmp_path / "tile.npz", problem)
     assert eqx.tree_equal(read_tile(tmp_path / "tile.npz"), problem)
+
+
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
+def test_loss_of_observations_reads_back_exactly(tmp_path: Path, loss: type):
+    problem, path = random_problem(priors=()), tmp_path / "tile.npz"
+    write_tile(path, problem)
+    assert read_loss(path) is None
+    write_tile(path, problem, loss=loss(f_scale=0.1))
+    assert eqx.tree_equal(read_loss(path), loss(f_scale=0.1))
+    assert eqx.tree_equal(read_tile(path), problem)
 
 
 def test_equal_problems_give_equal_bytes_whatever_types_and_layouts_they_have(tmp_path: Path):
@@ -220,6 +230,12 @@ POSITION = {
              f"prior_position_loss_alpha: loss Barron: alpha is {text}; give 2")
             for alpha, text in ((2.5, "2.5"), (np.nan, "nan"), (np.inf, "inf"))
         ),
+        ({"observation_loss": "l1"}, "observation_loss is 'l1'; use one of linear, soft_l1"),
+        ({"observation_loss": "huber", "observation_loss_alpha": 1.0},
+         "observation_loss_alpha is given, but huber has f_scale only"),
+        ({"observation_loss": "huber", "observation_loss_f_scale": 0.0},
+         "observation_loss_f_scale: loss Huber: f_scale is 0; give a positive number of sigmas"),
+        (POSITION | {"prior_position_offset_index": [1]}, r"offset_index\[0\] is 1, but offsets go from 0 to 0"),
         (POSITION | {"prior_position_image_index": [2]}, r"image_index\[0\] is 2, but images go from 0 to 1"),
         (POSITION | {"prior_position_xyz": np.ones((2, 3))}, "with 1 position_rows by prior_position_image_index"),
     ],

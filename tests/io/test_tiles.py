@@ -64,7 +64,8 @@ def test_equal_partitions_give_the_same_bytes_wherever_the_block_was_read(paths:
 
 
 def test_a_solved_tile_keeps_its_place(paths: list[Path], tmp_path: Path) -> None:
-    problem, extras = tile_of_bytes(paths[1].read_bytes(), "tile")
+    held = tile_of_bytes(paths[1].read_bytes(), "tile")
+    problem, extras = held.problem, held.extras
     moved = eqx.tree_at(lambda p: p.points, problem, problem.points + 1.0)
     solved = tmp_path / "tile_001.solved.npz"
     write_tile(solved, moved, extras=place_of(extras) | {"error_px": np.zeros(3)})
@@ -154,7 +155,7 @@ def test_a_place_that_contradicts_the_tile_is_refused(
 def test_images_left_out_of_a_tile_by_another_program_are_noticed(paths: list[Path]) -> None:
     tile = read_block_tile(paths[0]).tile
     smaller = jaxba.partition(tile.problem, max_images=4, overlap=0).tiles[0].problem
-    _, extras = tile_of_bytes(paths[0].read_bytes(), "tile")
+    extras = tile_of_bytes(paths[0].read_bytes(), "tile").extras
     write_tile(paths[0], smaller, extras=place_of(extras))
     with pytest.raises(JaxbaError, match=r"extra_tile_images has the shape \(6,\), .* cut the block again"):
         read_tiles(paths)

@@ -10,7 +10,7 @@ from small_survey import Survey
 from jaxba._errors import JaxbaError
 from jaxba.ba import covariance
 from jaxba.geometry import Huber
-from jaxba.io import read_tile
+from jaxba.io import read_loss, read_tile
 from jaxba.pipeline import PIPELINE
 from jaxba.pipeline._events import Run
 from jaxba.report import control_rows
@@ -67,7 +67,8 @@ def test_summary_and_terminal_tell_control_and_check_apart(run: Run) -> None:
 
 
 def test_tile_holds_the_control_points_with_their_marks(run: Run, survey: Survey) -> None:
-    problem = read_tile(survey.project / "export" / "tile.npz")
+    tile = survey.project / "export" / "tile.npz"
+    problem, loss = read_tile(tile), read_loss(tile)
     prior = problem.prior("control")
     assert prior is not None
     block = run.done.adjust.block
@@ -76,7 +77,8 @@ def test_tile_holds_the_control_points_with_their_marks(run: Run, survey: Survey
     std_px = run.done.adjust.mark_std_px
     assert 0.2 < std_px < 0.5  # they were set with 0.3
     assert marks.sum() >= 10 and set(np.asarray(problem.observations.std_px)[marks]) == {std_px}
-    found = covariance(problem, loss=Huber(run.done.adjust.loss_f_scale))  # the tile's sigmas are the run's
+    assert isinstance(loss, Huber)
+    found = covariance(problem, loss=loss)  # the tile's sigmas are the run's
     std_m = np.sqrt(np.einsum("nii->ni", found.centers))
     np.testing.assert_allclose(std_m, run.done.adjust.position_std_m, rtol=0.01)
     np.testing.assert_allclose(problem.position_offset[0], run.done.adjust.control.gnss_minus_control_m, atol=0.01)

@@ -6,7 +6,7 @@ about the block's middle and in units of its size, and J the rows of all priors 
 
     free directions = null space of (J D)^T (J D)
 
-A free lever arm adds three columns, as does a free offset of all positions: in a block without turns they move as a
+A free lever arm adds three columns, as does a free offset of positions: in a block without turns they move as a
 translation of the block does. Parts of a block that share no free pose or point are looked at one by one. Robust losses
 do not count: they weaken rows, and a row that has levelled off at the start values may come back.
 
@@ -26,7 +26,7 @@ from jaxba._errors import JaxbaError
 from jaxba.ba._compiler import fast_jit
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._rows import Rows
-from jaxba.ba._unknowns import Unknowns
+from jaxba.ba._unknowns import Unknowns, antenna_names
 from jaxba.ba.checks._connected_parts import Parts, hat, mean_by
 from jaxba.ba.checks._validate import validate
 from jaxba.geometry import Pose
@@ -36,11 +36,9 @@ _NULL = 1e-12  # eigenvalue over the largest: a direction held a million times m
 _REMOTE = 10.0  # sizes of the part: fixed points beyond count as if they were there
 _NEGLIGIBLE = 0.1  # of a direction's largest component: smaller ones are not named
 
-_NAMES = (
-    *(f"translation {a}" for a in "xyz"), *(f"rotation about {a}" for a in "xyz"), "scale",
-    *(f"lever arm {a}" for a in "xyz"), *(f"position offset {a}" for a in "xyz"),
-)  # fmt: skip
-_TURNING, _MOVING = (3, 4, 5, 6), (0, 1, 2, *range(7, 13))
+_NAMES = *(f"translation {a}" for a in "xyz"), *(f"rotation about {a}" for a in "xyz"), "scale"
+_TURNING = 3, 4, 5, 6
+_ABOUT = "image_index", "point_index", "camera_index"  # what a row of a prior is about
 
 
 def free_gauge(problem: Problem) -> tuple[str, ...]:
@@ -67,10 +65,10 @@ def free_gauge(problem: Problem) -> tuple[str, ...]:
         normal[:, 7:, 7:] += of_antenna
         columns = np.concatenate([columns, antenna])
     vectors, free = _null(normal[:, columns[:, None], columns])
-    names = {
-        name for part in np.flatnonzero(free.any(axis=1)) for name in _names(vectors[part][:, free[part]].T, columns)
-    }
-    return tuple(sorted(names, key=lambda name: [_NAMES.index(n) for n in name.split(" + ")]))
+    all_names = [*_NAMES, *antenna_names(len(problem.position_offset))]
+    parts_free = np.flatnonzero(free.any(axis=1))
+    names = {name for part in parts_free for name in _names(vectors[part][:, free[part]].T, columns, all_names)}
+    return tuple(sorted(names, key=lambda name: [all_names.index(n) for n in name.split(" + ")]))
 
 
 def require_gauge(problem: Problem, purpose: str) -> None:
@@ -87,6 +85,26 @@ def require_gauge(problem: Problem, purpose: str) -> None:
             cures = [f"Hold the {unknown} fixed or add a {unknown} prior with finite std_m.", *cures]
             cures = cures[: 1 if all(unknown in name for name in free) else 2]
     raise JaxbaError(f"{purpose}: problem has no gauge, {count} free ({', '.join(free)}). {' '.join(cures)}")
+
+
+def free_directions(
+    label: str, problem: Problem
+) -> tuple[Float[np.ndarray, "images 6 7"], Float[np.ndarray, "points 3 7"], float]:
+    """Return how the seven directions move poses (tangent steps) and points of a block, and its rms extent, metres.
+
+    What is fixed does not move. `label`: of what needs them, for messages.
+
+    Raises `JaxbaError` where parts of the block share no points.
+    """
+    parts = Parts.of(problem)
+    if len(parts.size) != 1:
+        raise JaxbaError(f"{label}: the block is in {len(parts.size)} parts that share no points; take each by itself.")
+    poses = parts.move_poses(np.maximum(parts.of_image, 0), problem.poses)
+    points = parts.move_points(np.maximum(parts.of_point, 0), np.asarray(problem.points, float))
+    of_images, of_points = (
+        np.asarray(mask, float)[:, None, None] for mask in (problem.free.poses, problem.free.points)
+    )
+    return poses * of_images, points * of_points, float(parts.size[0])
 
 
 def _normal_matrices(
@@ -176,14 +194,16 @@ def _antenna_determined(
     return bool(np.linalg.eigvalsh(schur)[0] > _NULL)
 
 
-def _names(null: Float[np.ndarray, "free columns"], of_columns: Int[np.ndarray, " columns"]) -> list[str]:
+def _names(
+    null: Float[np.ndarray, "free columns"], of_columns: Int[np.ndarray, " columns"], all_names: list[str]
+) -> list[str]:
     """Name a null space: a basis by elimination, rotations and scale first, which hide the translations they bring.
 
     - `of_columns`: which of all directions each column is.
     """
     rows, done, names = null.copy(), 0, []
-    for directions in (_TURNING, _MOVING):
-        columns = [c for c, direction in enumerate(of_columns) if direction in directions]
+    for are_turning in (True, False):
+        columns = [c for c, direction in enumerate(of_columns) if (direction in _TURNING) == are_turning]
         pivots = []
         while done < len(rows):
             block = np.abs(rows[done:, columns])
@@ -199,7 +219,7 @@ def _names(null: Float[np.ndarray, "free columns"], of_columns: Int[np.ndarray, 
         for pivot in pivots:
             size = np.abs(rows[pivot, columns])
             kept = [c for c, s in zip(columns, size, strict=True) if s > _NEGLIGIBLE * size.max()]
-            names.append(" + ".join(_NAMES[of_columns[c]] for c in sorted(kept)))
+            names.append(" + ".join(all_names[of_columns[c]] for c in sorted(kept)))
     return names
 
 
@@ -209,7 +229,7 @@ def prior_rows(prior: AbstractPrior, problem: Problem) -> Rows | None:
     None for a prior of cameras, or without rows.
     """
     fields = {f.name: getattr(prior, f.name) for f in dataclasses.fields(prior)}
-    index_name = next((name for name in fields if name.endswith("_index")), "")
+    index_name = next((name for name in _ABOUT if name in fields), "")
     if index_name == "camera_index" or (index_name and len(fields[index_name]) == 0):
         return None
     with jax.enable_x64(True):
@@ -221,7 +241,11 @@ def prior_rows(prior: AbstractPrior, problem: Problem) -> Rows | None:
         for start in range(0, max(len(index), 1), _CHUNK):
             # the piece's own unknowns, numbered 0, 1, ...; the last row fills it up
             of_piece = np.minimum(np.arange(start, start + _CHUNK), max(len(index) - 1, 0))
-            local = {n: np.asarray(v, float)[of_piece] for n, v in fields.items() if n not in ("loss", index_name)}
+            local = {
+                name: np.asarray(values, np.int32 if name.endswith("_index") else float)[of_piece]
+                for name, values in fields.items()
+                if name not in ("loss", index_name) and values is not None
+            }
             piece = dataclasses.replace(prior, **local, **{index_name: np.arange(_CHUNK, dtype=np.int32)})
             use = {"image_index": np.zeros(1, int), "point_index": np.zeros(1, int), index_name: index[of_piece]}
             rows = _of_geometry(piece, _unknowns(problem, use["image_index"], use["point_index"]))

@@ -32,6 +32,7 @@ def validate(problem: Problem) -> None:
         "observations": _length(problem.observations.xy_px),
         "cameras": _length(problem.lower),
         "parameters": len(parameters),
+        "offsets": _length(problem.position_offset),
     }
     if problem.image_names and len(problem.image_names) != sizes["images"]:
         names, images = len(problem.image_names), sizes["images"]
@@ -45,7 +46,7 @@ def validate(problem: Problem) -> None:
     _check_shape("observations.xy_px", seen.xy_px, "observations 2", sizes)
     _check_shape("observations.std_px", seen.std_px, "observations", sizes)
     _check_shape("lever_arm", problem.lever_arm, "3", sizes)
-    _check_shape("position_offset", problem.position_offset, "1 3" if len(problem.position_offset) else "0 3", sizes)
+    _check_shape("position_offset", problem.position_offset, "offsets 3", sizes)
     _check_shape("lower", problem.lower, "cameras parameters", sizes)
     _check_shape("upper", problem.upper, "cameras parameters", sizes)
     for field, value, dims in (
@@ -225,10 +226,11 @@ def _check_bounds(problem: Problem) -> None:
 def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int]) -> None:
     """Check any prior from its fields: `<kind>_index` refers to a kind, `std...` is a sigma, all else are values."""
     check_loss(f"prior {prior.name}: loss", prior.loss)
-    fields = [f for f in dataclasses.fields(prior) if f.name != "loss"]
+    fields = [f for f in dataclasses.fields(prior) if f.name != "loss" and getattr(prior, f.name) is not None]
     values = {f.name: np.asarray(getattr(prior, f.name)) for f in fields}
     sizes = {**sizes, "rows": _length(values[fields[0].name])}
-    index_name = next((name for name in values if name.endswith("_index")), None)
+    indices = [name for name in values if name.endswith("_index")]
+    index_name = indices[0] if indices else None
     kind = index_name.removesuffix("_index") if index_name else "row"
     label = _label(problem, kind)
     if index_name:
@@ -241,8 +243,12 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
                 f"prior {prior.name}: {label(int(twice[0]))} has more than one row{_more(twice)}; keep one of them."
             )
         label = lambda row: of_kind(int(index[row]))  # noqa: E731
+    at_least_one = {**sizes, "offsets": max(sizes["offsets"], 1)}  # without offsets, rows have the first one
+    for name in indices[1:]:
+        into = f"{name.removesuffix('_index')}s"
+        _check_index(problem, f"prior {prior.name}: {name}", values[name], "rows", into, at_least_one)
     for field in fields:
-        if field.name == index_name:
+        if field.name.endswith("_index"):
             continue
         name, value = f"prior {prior.name}: {field.name}", values[field.name]
         _check_shape(name, value, _dims(field.type), sizes)

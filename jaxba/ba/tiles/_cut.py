@@ -149,7 +149,8 @@ def sub_problem(
 
     def taken(prior: AbstractPrior, rows: Int[np.ndarray, " rows"]) -> AbstractPrior:
         """Return the prior with these rows alone."""
-        fields = {name: np.asarray(value)[rows] for name, value in vars(prior).items() if name != "loss"}
+        given = {name: value for name, value in vars(prior).items() if name != "loss" and value is not None}
+        fields = {name: np.asarray(value)[rows] for name, value in given.items()}
         return dataclasses.replace(
             prior, **{name: places[name][value] if name in places else value for name, value in fields.items()}
         )

@@ -71,10 +71,17 @@ def frame_of_block(problem: Problem) -> Frame:
         (POINT, held_points, np.asarray(problem.points, float)[held_points], np.full(3, _HELD_STD)),
     ]
     turns = [(held_images, rotations[held_images], np.full(len(held_images), _HELD_STD))]
-    offset = np.sum(np.asarray(problem.position_offset, float), axis=0)
+    offsets = np.asarray(problem.position_offset, float)
     for prior in problem.priors:
         if isinstance(prior, PositionPrior):
-            parts.append((ANTENNA, np.asarray(prior.image_index), prior.xyz - offset, np.asarray(prior.std_m)))
+            parts.append(
+                (
+                    ANTENNA,
+                    np.asarray(prior.image_index),
+                    np.asarray(prior.xyz - prior.offset(offsets)),
+                    np.asarray(prior.std_m),
+                )
+            )
         elif isinstance(prior, ControlPointPrior):
             free = np.asarray(problem.free.points)[prior.point_index]
             index, xyz, std_m = (np.asarray(of)[free] for of in (prior.point_index, prior.xyz, prior.std_m))

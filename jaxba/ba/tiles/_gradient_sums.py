@@ -25,7 +25,7 @@ class GradientSums:
             {
                 n: np.zeros(np.shape(v))
                 for n, v in vars(prior).items()
-                if n != "loss" and np.asarray(v).dtype.kind == "f"
+                if n != "loss" and v is not None and np.asarray(v).dtype.kind == "f"
             }
             for prior in problem.priors
         ]

@@ -106,8 +106,8 @@ class SolveOptions:
     datum: Annotated[
         Literal["priors", "inner"],
         Parameter(
-            help="What --statistics takes a block's place from: its priors and what is fixed, or inner constraints over "
-            "the points, under which sigmas are those of the photos alone."
+            help="What tells --statistics a block's place: its priors and what is fixed, or inner constraints over the "
+            "points, under which sigmas are those of the photos alone."
         ),
     ] = "priors"
     estimate_weights: Annotated[

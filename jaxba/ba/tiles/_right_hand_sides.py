@@ -60,4 +60,4 @@ def _solved(engine: Engine, unknowns: Unknowns, rhs: Step) -> Step:
 def _points(system: System, model: Linearisation, rhs: Step, images: Array, border: Array) -> Array:
     damped, of_points = damped_points(model, jnp.zeros(()))
     points = eliminate(damped, of_points + (1 - system.free.points))
-    return back_substitute(system, points, rhs, ReducedVector(images, border)).points
+    return jnp.asarray(back_substitute(system, points, rhs, ReducedVector(images, border)).points)

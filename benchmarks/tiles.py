@@ -11,6 +11,10 @@ them are solved in one piece as well. `--shapes`: in place of all that, blocks o
 `--max-memory`.
 Prints the seconds of a first call, which compiles, and the peak of memory.
 
+`--statistics`: in place of all that, everything that `jaxba solve --statistics` tells of blocks of these sizes, in
+seconds of a first call and of a second: `jaxba.statistics` with the tables of observations, images and points, and
+`jaxba.propagate` of the coordinates of ten points; and the peak of memory.
+
 `--batch`: in place of all that, 64 blocks of 20 to 50 images by `solve_batch`, by `solve` one after another, and every
 sixteenth of them by scipy. Prints what compiling takes, and the seconds without it (of a batch the median of three).
 
@@ -67,6 +71,7 @@ def main() -> None:
     parser.add_argument("--batch", action="store_true")
     parser.add_argument("--merge", action="store_true")
     parser.add_argument("--covariance", type=int, nargs="*")
+    parser.add_argument("--statistics", type=int, nargs="*")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -74,6 +79,9 @@ def main() -> None:
         return
     if options.shapes:
         _shapes()
+        return
+    if options.statistics is not None:
+        _statistics(options.statistics or [500, 2000])
         return
     if options.covariance is not None:
         _covariance(options.covariance or [1000, 4000, 16000], options.max_memory)
@@ -146,6 +154,20 @@ def _covariance(sizes: list[int], max_memory: str) -> None:
             file.unlink()
 
 
+def _statistics(sizes: list[int]) -> None:
+    """Print the table of statistics."""
+    print("| images | observations | statistics (s) | again | ten points (s) | again | peak of memory (GB) |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    with tempfile.TemporaryDirectory() as folder:
+        for size in sizes:
+            file = Path(folder) / f"{size}.npz"
+            _run("make", file, {"num_images": size})
+            found = _run("statistics", file, {})
+            seconds = " | ".join(f"{found[name]:.1f}" for name in ("first", "again", "points", "points_again"))
+            print(f"| {size} | {found['observations']:,} | {seconds} | {found['peak'] / 1e9:.2f} |", flush=True)
+            file.unlink()
+
+
 def _run(way: str, file: Path, options: dict[str, Any] | None = None) -> dict[str, float]:
     command = [sys.executable, "-m", "benchmarks.tiles", "--one", way, str(file), json.dumps(options)]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
@@ -163,6 +185,20 @@ def _one(way: str, file: str, options: str) -> None:
         jaxba.covariance(problem, **json.loads(options))
         seconds = time.perf_counter() - begun
         print(json.dumps({"observations": problem.num_observations, "seconds": seconds, "peak": _peak()}))
+        return
+    if way == "statistics":
+        chosen = np.linspace(0, problem.num_points - 1, 10).astype(int)
+        told: dict[str, float] = {"observations": problem.num_observations}
+        for first, points in (("first", "points"), ("again", "points_again")):
+            begun = time.perf_counter()
+            of_block = jaxba.statistics(problem)
+            for table in (of_block.observations_frame, of_block.images_frame, of_block.points_frame):
+                table()
+            told[first] = time.perf_counter() - begun
+            begun = time.perf_counter()
+            jaxba.propagate(lambda p: p.points[chosen], problem)
+            told[points] = time.perf_counter() - begun
+        print(json.dumps({**told, "peak": _peak()}))
         return
     views = np.bincount(problem.observations.point_index)
     loaded = _peak()

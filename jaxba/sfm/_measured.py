@@ -53,7 +53,8 @@ def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]
     the residuals show. Sigmas of more than `PLAIN_M` are those of a single receiver, mostly an offset that all
     positions of a flight have in common; their scatter alone tells their weight against each other, down to a tenth.
     Outliers do not count, and under six positions it is 1. A similarity has fitted the block to the positions, which
-    takes seven degrees of freedom from the three axes.
+    takes seven degrees of freedom from the three axes. A sigma that f degrees of freedom tell is itself uncertain: what
+    follows from it errs as Student's t does, whose sigma is sqrt(f / (f - 2)) times as large.
     """
     used = used_positions(block, reference)
     index = block.image_index[used]
@@ -69,7 +70,7 @@ def position_scale(block: Block, reference: Reference) -> Float[np.ndarray, "3"]
         kept = residual[np.abs(residual) <= robust_limit(len(residual)) * robust]
         freedom = len(kept) - 7 / 3
         total = float(np.sum((kept - kept.mean()) ** 2))
-        shown = np.sqrt(total / freedom)
+        shown = np.sqrt(total / (freedom - 2))
         if np.median(std[known]) > PLAIN_M:
             scale[axis] = max(shown, _LEAST_SCATTER)
         elif shown > 1 and chdtrc(freedom, total) < BY_CHANCE:

@@ -23,9 +23,8 @@ from jaxba.scene import Block
 from jaxba.sfm._points import redundancy_root
 
 _LEAST_REDUNDANCY = 30  # to tell how errors are spread
-_LEAST_POSITIONS = 6  # likewise
-_MOST_YIELDING = 1.5
-_MOST_SPREAD = 0.8, 1.25  # beyond that their sigmas are what is wrong, and not how they bear on the result
+_LET_GO = 0.1  # weight of a position that its loss has let go
+_FARTHEST, _STEPS = 8.0, 2000  # sigmas, of sums over normal errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,27 +67,29 @@ def spread(block: Block, error_px: Float[np.ndarray, " observations"], std_px: f
 def position_spread(problem: Problem, prior: PositionPrior) -> Spread:
     """Return how the errors of positions bear on the result under their loss.
 
-    Weights that a loss takes from positions as good as any make the covariance larger than it is: for normal errors and
-    `POSITION_LOSS` by a third, where the estimate loses 6%. As in `spread`, over three coordinates a position; a block
-    that is fitted to them takes seven degrees of freedom. Within `_MOST_SPREAD`, and 1 of few positions.
+    A few positions do not tell how their errors are spread: they are taken as normal, as their sigmas say. Weights of
+    positions that are as good as any make the covariance larger than it is: for normal errors and `POSITION_LOSS` by a
+    third, where the estimate loses 7%. With w the mean weight of the positions that the loss has not let go,
+
+        scatter^2 = w E psi^2 / (E psi')^2,   yielding^2 = w / E psi'
+
+    expectations of normal errors as in `spread`, over three coordinates.
     """
-    count = len(prior.xyz)
-    freedom = 3 * count - 7
-    if count < _LEAST_POSITIONS:
-        return Spread()
     with jax.enable_x64(True):
         center = np.asarray(problem.poses.center)[prior.image_index]
         moved = center + prior.offset(np.asarray(problem.position_offset)) - prior.xyz
         squared = np.sum((moved / prior.std_m) ** 2, axis=1)
-        comparable = squared * 3 * count / freedom
         weight = np.asarray(prior.loss.derivatives(jnp.asarray(squared))[1])
-        _, expected, change = (np.asarray(part) for part in prior.loss.derivatives(jnp.asarray(comparable)))
-    slope = np.mean(expected + 2 / 3 * comparable * change)
-    if slope <= 0:
+        z = (np.arange(_STEPS) + 0.5) * _FARTHEST / _STEPS  # over sigma; chi's density of three degrees follows
+        of_normal, change = (np.asarray(part) for part in prior.loss.derivatives(jnp.asarray(z**2))[1:])
+    share = z**2 * np.exp(-(z**2) / 2)
+    share /= share.sum()
+    slope = float(share @ (of_normal + 2 / 3 * z**2 * change))
+    kept = weight[weight > _LET_GO]
+    if slope <= 0 or not len(kept):
         return Spread()
-    mean = np.mean(expected)
-    scatter = np.clip(np.sqrt(np.sum(weight**2 * squared) / freedom * mean) / slope, *_MOST_SPREAD)
-    return Spread(float(scatter), float(np.clip(np.sqrt(mean / slope), 1.0, _MOST_YIELDING)))
+    mean, squares = float(kept.mean()), float(share @ (of_normal * z) ** 2) / 3
+    return Spread(np.sqrt(mean * squares) / slope, np.sqrt(mean / slope))
 
 
 def weighed(problem: Problem, times: float, num_own: int, *, yielding: bool = False) -> Problem:

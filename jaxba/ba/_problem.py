@@ -86,7 +86,7 @@ class Problem(eqx.Module):
     - `lower`, `upper`: bounds on the intrinsics, infinite where there is none.
     - `image_names`: used in messages; empty, or one an image.
     - `position_offset`: what positions of the position prior have in common beside their errors, measured minus true,
-      metres, world: a row for all of them, or one a flight (`PositionPrior.offset_index`); none without such unknowns.
+      metres, world: a row for all of them, one a flight, a drift (`PositionPrior.offset_weights`); none without such.
 
     `Problem.build` fills in the defaults; `fix` and `bound` return changed copies.
     """

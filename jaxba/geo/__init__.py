@@ -7,6 +7,7 @@ from jaxba.geo._against_tags import hold_against_tags
 from jaxba.geo._attitudes import local_attitudes
 from jaxba.geo._control import AS_PHOTOS, Surveyed, heights_above, surveyed_points
 from jaxba.geo._crs import describe, parse_crs, target_crs, utm_zone
+from jaxba.geo._flights import flight_numbers
 from jaxba.geo._frame import (
     geodetic_from_local,
     grid_from_local,
@@ -23,9 +24,9 @@ from jaxba.geo._positions import Measured, measured_positions
 from jaxba.geo._readings import distance_m, elsewhere, would_fit
 
 __all__ = [
-    "AS_PHOTOS", "UNTRUSTED", "HeightDrift", "HeightStep", "Judgement", "Measured", "Operation", "Surveyed",
-    "describe", "distance_m", "elsewhere", "frame_notes", "geodetic_from_local", "grid_from_local", "height_notes",
-    "height_step", "heights_above", "hold_against_tags", "horizontal_operation", "judge_positions", "list_heights",
-    "local_attitudes", "local_frame", "local_from_geodetic", "local_from_projected", "measured_positions",
-    "parse_crs", "projected_from_local", "surveyed_points", "target_crs", "utm_zone", "would_fit",
+    "AS_PHOTOS", "UNTRUSTED", "HeightDrift", "HeightStep", "Judgement", "Measured", "Operation", "Surveyed", "describe",
+    "distance_m", "elsewhere", "flight_numbers", "frame_notes", "geodetic_from_local", "grid_from_local",
+    "height_notes", "height_step", "heights_above", "hold_against_tags", "horizontal_operation", "judge_positions",
+    "list_heights", "local_attitudes", "local_frame", "local_from_geodetic", "local_from_projected",
+    "measured_positions", "parse_crs", "projected_from_local", "surveyed_points", "target_crs", "utm_zone", "would_fit",
 ]  # fmt: skip

@@ -86,7 +86,7 @@ def _in_kind(array: np.ndarray, spec: ArraySpec, label: str) -> np.ndarray:
 
 def _check_values(array: np.ndarray, spec: ArraySpec, known: Mapping[str | int, int], label: str) -> None:
     if spec.indexes:
-        count = known.get(spec.indexes, 1)  # of offsets there may be none
+        count = known.get(spec.indexes, 0)  # of offsets there may be none
         bad = np.flatnonzero((array < 0) | (array >= count))
         if bad.size:
             raise JaxbaError(

@@ -122,7 +122,7 @@ _PRIOR_FIELDS = {
     "xyz": ("m", "world", "measured position (position: of the antenna; control: of the point)"),
     "lever_arm_xyz": ("m", "camera", "measured lever arm"),
     "position_offset_xyz": ("m", "world", "expected offset, mostly zero"),
-    "position_offset_index": ("", "", "position offset that each row has; the first of all where it is left out"),
+    "offset_weights": ("1", "", "by which each position offset counts in each row; 1 where it is left out"),
     "position_offset_offset_index": ("", "", "position offset of each row; in their order where it is left out"),
     "std_m": ("m", "that of xyz", "standard deviation an axis; infinite where it is not measured"),
     "quaternion": ("1", "cam_from_world", "measured rotation, unit quaternion, scalar first"),

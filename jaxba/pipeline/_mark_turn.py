@@ -28,6 +28,9 @@ TURNS = {
 _FITS = 0.15  # of the longer side, median, twice outside: positions of metres and tilts of degrees see points so near
 _CLEARLY = 0.5  # of the distance on the stored grid
 _LEAST_MARKS = 3
+_OTHER_SIZE = (
+    1.3  # of the photos that marks were set in, over the photos'; nearer ones may be errors of what is expected
+)
 _NEARLY = 1.2  # the photos' own orientation counts before others that fit about as well
 
 
@@ -83,6 +86,25 @@ def best_turn(
     if away_px[best] > limit_px:
         return "stored", away_px
     return best, away_px
+
+
+def other_size(
+    xy_px: Float[np.ndarray, "marks 2"], expected_px: Float[np.ndarray, "marks 2"], side_px: float
+) -> tuple[float, float, float] | None:
+    """Return the factor by which marks fit where they are expected, and the median distances with and without it.
+
+    None where no factor far from 1 makes them fit clearly better, or too few places are known.
+    """
+    known = np.isfinite(expected_px).all(axis=1)
+    if known.sum() < _LEAST_MARKS:
+        return None
+    factors = np.geomspace(0.1, 10.0, 401)
+    away_px = [float(np.median(np.hypot(*(f * xy_px - expected_px)[known].T))) for f in (1.0, *factors)]
+    best = int(np.argmin(away_px[1:]))
+    factor, scaled_px, unscaled_px = float(factors[best]), away_px[1 + best], away_px[0]
+    if abs(np.log(factor)) < np.log(_OTHER_SIZE) or scaled_px > min(_FITS * side_px, _CLEARLY * unscaled_px):
+        return None
+    return factor, scaled_px, unscaled_px
 
 
 def expected_px(

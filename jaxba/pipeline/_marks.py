@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba._errors import JaxbaError
 from jaxba.io import Mark, SurveyedPoint, like_photo, photo_finder
-from jaxba.pipeline._mark_turn import TURNS, best_turn, on_stored_grid, shown_size
+from jaxba.pipeline._mark_turn import TURNS, best_turn, on_stored_grid, other_size, shown_size
 from jaxba.scene import LeftOut, Photo
 
 Expected = Callable[[Int[np.ndarray, " marks"], Int[np.ndarray, " marks"]], Float[np.ndarray, "marks 2"]]
@@ -118,8 +118,10 @@ def marks_in_photos(
         name=name,
     )
     own, notes = given.orientation, []
+    seen_px = None
+    if orientation == "auto" and expected is not None:
+        seen_px = expected(np.array(point), np.array(image))
     if orientation == "auto":
-        seen_px = None if expected is None else expected(np.array(point), np.array(image))
         notes = _refuse_turned(given, seen_px)
     turn = own if orientation == "exif" else np.full(len(own), int(orientation) if orientation.isdigit() else 1)
     if orientation not in ("auto", "stored"):
@@ -127,6 +129,8 @@ def marks_in_photos(
         notes.append(f"{name}: marks are turned back by {how} (control.mark_orientation={orientation}).")
     xy_px, scaled = _on_grid(given, turn)
     notes += scaled
+    if orientation == "auto" and mark_width_px is None and not scaled:
+        _refuse_other_size(given, xy_px, seen_px)
     outside = _outside(xy_px, given.size_px)
     for k in np.flatnonzero(outside):
         photo = photos[image[k]]
@@ -183,6 +187,24 @@ def _refuse_turned(given: _Given, expected_px: Float[np.ndarray, "marks 2"] | No
     if not turned and "stored" in away_px:  # a yaw that is off by half a turn looks the same
         return [f"{text}. They are taken as they are; the attitudes may be wrong instead. {cure}"]
     raise JaxbaError(f"{text}.{f' {are}.' if turned else ''} {cure}")
+
+
+def _refuse_other_size(
+    given: _Given, xy_px: Float[np.ndarray, "marks 2"], expected_px: Float[np.ndarray, "marks 2"] | None
+) -> None:
+    """Refuse marks on the photos' grid that fit photos of another size, such as the previews of a viewer, alone."""
+    found = None if expected_px is None else other_size(xy_px, expected_px, float(given.size_px.max()))
+    if found is None:
+        return
+    factor, away_px, unscaled_px = found
+    width = given.size_px[0, 0]
+    raise JaxbaError(
+        f"{given.name}: marks count on the photos' pixel grid, {width:.0f} px wide, and there they lie "
+        f"{unscaled_px:.0f} px from where positions and attitudes see the points (median); set in photos of some "
+        f"{width / factor:.0f} px width they would lie {away_px:.0f} px from there. Give the width of the photos that "
+        f"they were set in, such as --set control.mark_width_px={width / factor:.0f}, or that of these photos "
+        f"(control.mark_width_px={width:.0f}) to take them as they are."
+    )
 
 
 def _same_pixel(

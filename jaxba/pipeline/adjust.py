@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._room import Room
 from jaxba.engine._words import many
-from jaxba.report import Told, control_facts, grouped, sentences
+from jaxba.report import Told, control_facts, flight_facts, flight_lines, grouped, sentences
 from jaxba.scene import (
     Block,
     CommonOffset,
@@ -19,6 +19,7 @@ from jaxba.scene import (
     ControlFit,
     Features,
     Finding,
+    FlightOffsets,
     Photo,
     PrunedEdge,
     Reference,
@@ -79,7 +80,7 @@ class Outputs:
     - `position_std_m`: sigma of each registered image's position, east, north, up; NaN where it was not computed.
     - `point_std_m`: sigma of each point; NaN likewise.
     - `intrinsics_std`: sigma of each intrinsic.
-    - `gnss_residual_m`: adjusted minus measured position; NaN where none was used.
+    - `gnss_residual_m`: adjusted minus measured position, less what its flight is off; NaN where none was used.
     - `median_px`, `inlier_rate`, `variance_factor`, `num_rejected`, `rounds`: figures of the adjustment.
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
     - `std_px`: sigma of an observation's coordinates. `spread`: times it that errors really bear on the result, which
@@ -87,6 +88,7 @@ class Outputs:
     - `position_scale`: factor on the sigmas of positions, an axis.
     - `pruned`: edges left out, with their figures. `solver`: why the last solve stopped, as `Solution.result` names it.
     - `common`: what positions have in common as an unknown, and its prior sigma; None where it was none.
+    - `flights`: what positions of each flight are off in common; None where flights are not told apart.
     - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
     - `mark_std_px`: sigma of a mark that weighed them.
     - `affine`: 3 x 4, what coordinates take beside the block, of `control.method=affine`; else the identity.
@@ -113,6 +115,7 @@ class Outputs:
     pruned: tuple[PrunedEdge, ...] = ()
     solver: str = ""
     common: CommonOffset | None = None
+    flights: FlightOffsets | None = None
     control: ControlFit = field(default_factory=ControlFit.nothing)
     mark_used: Bool[np.ndarray, " marks"] = field(default_factory=lambda: np.zeros(0, bool))
     mark_std_px: float = 1.0
@@ -157,6 +160,8 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         tiling,
     )
     sigmas = sfm.uncertainty(adjusted, reference)
+    flights = sfm.flight_offsets(adjusted, sigmas, reference)
+    reference = sfm.without_offsets(reference, flights)
     control = dataclasses.replace(inputs.control, mark_std_px=adjusted.mark_std_px)
     controlled = sfm.apply_control(adjusted, sigmas, control, reference)
     block = controlled.block
@@ -199,6 +204,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         pruned=adjusted.pruned,
         solver=adjusted.solution.result,
         common=adjusted.common,
+        flights=flights,
         control=controlled.fit,
         mark_used=adjusted.mark_used,
         mark_std_px=adjusted.mark_std_px,
@@ -217,6 +223,8 @@ def lines(outputs: Outputs, told: Told) -> list[str]:
             f"Variance factor {factor:.2f}: residuals scatter by {np.sqrt(factor):.2f} times the "
             f"{outputs.std_px:.2f} px that weighed them; the sigmas of the results allow for it."
         )
+    if outputs.flights is not None:
+        made += flight_lines(outputs.flights)
     return [*made, *grouped(told.left_out)]
 
 
@@ -237,6 +245,7 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
         "std_px": outputs.std_px,
         "gnss_rms_m": None if outputs.gnss_rms_m is None else list(outputs.gnss_rms_m),
         "num_gnss": outputs.num_gnss,
+        "flights": flight_facts(outputs.flights),
         "camera_model": block.camera_model,
         "cameras": {
             name: {"parameters": list(map(float, row)), "std": list(map(float, std))} for name, row, std in cameras

@@ -51,6 +51,12 @@ class Params(Parameters):
         3.0, low=0.01, high=100, help="sigma east and north of a position without accuracy or fix, metres"
     )
     std_v: float = parameter(5.0, low=0.01, high=200, help="sigma of its height, metres")
+    flight_offset: float | None = parameter(
+        None,
+        low=0.001,
+        high=100,
+        help="sigma of an offset that the positions of each flight have in common, metres; none: no flight has its own",
+    )
     attitude_std: float = parameter(2.0, low=0.01, high=90, help="sigma of gimbal pitch and roll, degrees")
     yaw_std: float = parameter(5.0, low=0.01, high=180, help="sigma of gimbal yaw, degrees")
 
@@ -109,6 +115,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         tilt_std_rad=np.radians(params.attitude_std),
         yaw_std_rad=np.radians(params.yaw_std),
     )
+    flight = None if params.flight_offset is None else geo.flight_numbers(photos, measured)
     reference = Reference(
         frame=frame,
         xyz_m=xyz_m,
@@ -125,9 +132,25 @@ def run(inputs: Inputs, params: Params) -> Outputs:
             *geo.height_notes(measured, judged, frame),
             *judged.notes,
             *attitude_notes,
+            *_flight_notes(flight, params),
         ),
+        flight=flight,
+        flight_std_m=params.flight_offset,
     )
     return Outputs(reference=reference, target_crs=params.target_crs)
+
+
+def _flight_notes(flight: np.ndarray | None, params: Params) -> list[str]:
+    if flight is None:
+        return []
+    counts = np.bincount(flight)
+    if len(counts) < 2:
+        return [f"crs.flight_offset={params.flight_offset:g} has no effect: all photos are of one flight."]
+    photos = ", ".join(map(str, counts))
+    return [
+        f"{len(counts)} flights, told by pauses and cameras, of {photos} photos: the positions of each have an offset "
+        f"of their own, of a sigma of {params.flight_offset:g} m (crs.flight_offset)."
+    ]
 
 
 def lines(outputs: Outputs, told: Told) -> list[str]:

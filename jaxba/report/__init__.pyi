@@ -6,7 +6,11 @@ from ._pairs import pair_facts as pair_facts, pair_lines as pair_lines
 from ._picture import Picture as Picture, draw_picture as draw_picture
 from ._reasons import grouped as grouped, with_ranges as with_ranges
 from ._recorded import Recorded as Recorded, recorded as recorded
-from ._reference import reference_facts as reference_facts
+from ._reference import (
+    flight_facts as flight_facts,
+    flight_lines as flight_lines,
+    reference_facts as reference_facts,
+)
 from ._status import Status as Status, project_settings as project_settings, status as status
 from ._summary import summary as summary, told_of as told_of
 from ._tiles_picture import draw_tiles as draw_tiles

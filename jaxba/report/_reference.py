@@ -1,8 +1,10 @@
-"""What is said of the place on earth: the CRS, what heights are above, positions on review."""
+"""What is said of the place on earth: the CRS, what heights are above, positions on review, offsets of flights."""
 
 from typing import Any
 
-from jaxba.scene import Reference
+import numpy as np
+
+from jaxba.scene import FlightOffsets, Reference
 
 
 def reference_facts(reference: Reference) -> dict[str, Any]:
@@ -16,3 +18,31 @@ def reference_facts(reference: Reference) -> dict[str, Any]:
             "review": [{"name": entry.name, "reason": entry.reason} for entry in reference.review],
         }
     }
+
+
+def flight_facts(flights: FlightOffsets | None) -> list[dict[str, Any]]:
+    """Return what the positions of each flight are off in common, with its sigma; nothing where that was not asked."""
+    if flights is None:
+        return []
+    columns = flights.number, flights.num_photos, flights.offset_m, flights.std_m
+    return [
+        {
+            "flight": int(number) + 1,
+            "photos": int(count),
+            "offset_m": list(map(float, offset)),
+            "std_m": [float(value) if np.isfinite(value) else None for value in std],
+        }
+        for number, count, offset, std in zip(*columns, strict=True)
+    ]
+
+
+def flight_lines(flights: FlightOffsets) -> list[str]:
+    """Return the same in words."""
+    lines = []
+    for fact in flight_facts(flights):
+        values = ", ".join(
+            f"{value:+.3f}" + ("" if std is None else f" ({std:.3f})")
+            for value, std in zip(fact["offset_m"], fact["std_m"], strict=True)
+        )
+        lines.append(f"Flight {fact['flight']}, {fact['photos']} photos: positions off by {values} m east, north, up.")
+    return lines

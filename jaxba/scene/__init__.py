@@ -14,15 +14,16 @@ from jaxba.scene._footprint import Footprints, footprint_overlaps, footprint_pai
 from jaxba.scene._graph import components
 from jaxba.scene._pair_record import Fallback, Missed, Model, PairRecord
 from jaxba.scene._photo import Fix, FocalSource, HeightKind, LeftOut, Lens, Photo, PhotoFile, Position
-from jaxba.scene._reference import CommonOffset, LocalFrame, Reference
+from jaxba.scene._reference import CommonOffset, FlightOffsets, LocalFrame, Reference
 from jaxba.scene._track_building import build_tracks
 from jaxba.scene._tracks import Tracks
 from jaxba.scene._view_graph import EdgeStatus, PrunedEdge, ViewGraph
 
 __all__ = [
     "Attitude", "Block", "CommonOffset", "Control", "ControlFit", "EdgeStatus", "Fallback", "Features", "Finding",
-    "Fix", "FocalSource", "Footprints", "HeightKind", "LeftOut", "Lens", "LocalFrame", "Missed", "Model", "PairRecord",
-    "Photo", "PhotoFile", "Position", "PrunedEdge", "Reference", "Tracks", "ViewGraph", "build_tracks",
-    "cam_from_enu", "components", "described", "fault", "footprint_overlaps", "footprint_pairs", "ground_footprints",
-    "joining_pairs", "lacks_memory", "nearest_pairs", "pairs_between", "rising_pairs", "window_pairs",
+    "Fix", "FlightOffsets", "FocalSource", "Footprints", "HeightKind", "LeftOut", "Lens", "LocalFrame", "Missed",
+    "Model", "PairRecord", "Photo", "PhotoFile", "Position", "PrunedEdge", "Reference", "Tracks", "ViewGraph",
+    "build_tracks", "cam_from_enu", "components", "described", "fault", "footprint_overlaps", "footprint_pairs",
+    "ground_footprints", "joining_pairs", "lacks_memory", "nearest_pairs", "pairs_between", "rising_pairs",
+    "window_pairs",
 ]  # fmt: skip

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxba.scene._photo import LeftOut
 
@@ -42,6 +42,8 @@ class Reference:
     - `quaternion`: attitude, `cam_from_world`, scalar first. `attitude_std_rad`: its sigma about each axis.
     - `is_used`: the position is trusted enough to be a prior.
     - `height_above_ground_m`: from the flight's relative altitude; NaN where it is unknown.
+    - `flight`: of each image, from 0, and `flight_std_m`: sigma of what the positions of a flight have in common and no
+      others; None where flights are not told apart.
     - `review`: images whose position is not used, or used with a large sigma of its own, with the reason.
     - `notes`: what was found and decided, in sentences.
     """
@@ -55,6 +57,8 @@ class Reference:
     height_above_ground_m: Float[np.ndarray, " images"]
     review: tuple[LeftOut, ...] = ()
     notes: tuple[str, ...] = ()
+    flight: Int[np.ndarray, " images"] | None = None
+    flight_std_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,3 +67,16 @@ class CommonOffset:
 
     start_m: Float[np.ndarray, "3"]
     std_m: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class FlightOffsets:
+    """What the positions of each flight have in common, measured minus true, world, metres; one row a flight.
+
+    - `number`: as in `Reference.flight`. `num_photos`: with a position that is used. `std_m`: sigma, NaN where unknown.
+    """
+
+    number: Int[np.ndarray, " flights"]
+    num_photos: Int[np.ndarray, " flights"]
+    offset_m: Float[np.ndarray, "flights 3"]
+    std_m: Float[np.ndarray, "flights 3"]

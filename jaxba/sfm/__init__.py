@@ -4,8 +4,9 @@ from jaxba.sfm._adjust import Adjusted, adjust
 from jaxba.sfm._control import agreeing_marks, control_part
 from jaxba.sfm._control_findings import control_findings
 from jaxba.sfm._control_fit import Controlled, apply_affine, apply_control
-from jaxba.sfm._control_start import place_by_control
+from jaxba.sfm._control_start import place_by_control, transformed
 from jaxba.sfm._findings import GnssFit, findings, gnss_fit, height_above_ground
+from jaxba.sfm._flights import flight_offsets, without_offsets
 from jaxba.sfm._initialise import initialise
 from jaxba.sfm._intrinsics import AtBound, free_parameters, intrinsics_at_bounds
 from jaxba.sfm._points import with_points
@@ -16,7 +17,7 @@ from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [
     "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Tiling", "Uncertainty", "adjust", "agreeing_marks",
-    "apply_affine", "apply_control", "control_findings", "control_part", "findings", "free_parameters", "gnss_fit",
-    "height_above_ground", "initialise", "intrinsics_at_bounds", "place_by_control", "positions_hold", "to_problem",
-    "uncertainty", "weighed", "with_points",
+    "apply_affine", "apply_control", "control_findings", "control_part", "findings", "flight_offsets",
+    "free_parameters", "gnss_fit", "height_above_ground", "initialise", "intrinsics_at_bounds", "place_by_control",
+    "positions_hold", "to_problem", "transformed", "uncertainty", "weighed", "with_points", "without_offsets",
 ]  # fmt: skip

@@ -1,10 +1,10 @@
 """Judging observations: the limit of a round's errors, and the sigma of an observation.
 
 Errors are compared as if all were in long tracks, times `redundancy_root` of theirs: in a track of two views a point
-takes up three quarters of the errors. The limit is median + factor x MAD over all observations, those left out before
-included, so that what was left out returns when it fits and the tail is cut once and not anew in each round. It is at
-most `track_threshold`, unless the median is still so large that this would leave nothing, and not below `f_scale`: what
-the loss counts in full is no outlier.
+takes up three quarters of the errors. What is over the limit is told by `tail_root`. The limit is median + factor x MAD
+over all observations, those left out before included, so that what was left out returns when it fits and the tail is
+cut once and not anew in each round. It is at most `track_threshold`, unless the median is still so large that this
+would leave nothing, and not below `f_scale`: what the loss counts in full is no outlier.
 
 Nor is it below 3.5 sigmas, as normal errors of that median have them. Median + 2.5 MAD cuts these at 2.3 sigmas: the
 variances of the result grow by a third, which no covariance shows, and the block remembers where it started, since what

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import AbstractPrior, ControlPointPrior, Problem, propagate
+from jaxba.ba import AbstractPrior, ControlPointPrior, PositionPrior, Problem, propagate
 from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control, Reference
 from jaxba.sfm._control import CONTROL_LOSS, Standing, after_tests
@@ -141,7 +141,7 @@ def _misclosure(
 
 
 def without_control(problem: Problem) -> Problem:
-    """Return the problem with the survey of its control points of no weight, and the positions' offset as it is."""
+    """Return the problem with its control points' survey of no weight, and an offset of all positions as it is."""
 
     def weightless(prior: AbstractPrior) -> AbstractPrior:
         if not isinstance(prior, ControlPointPrior):
@@ -149,6 +149,9 @@ def without_control(problem: Problem) -> Problem:
         return dataclasses.replace(prior, std_m=np.full(prior.std_m.shape, np.inf))
 
     problem = dataclasses.replace(problem, priors=tuple(map(weightless, problem.priors)))
+    position = problem.prior("position")
+    if isinstance(position, PositionPrior) and position.offset_weights is not None:
+        return problem  # those of flights bend the block, and are known from it
     return eqx.tree_at(lambda p: p.free.position_offset, problem, np.array(False))
 
 

@@ -21,6 +21,7 @@ that photos cannot fix stay where they were, and nothing else is bent (sigma a t
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -42,7 +43,7 @@ from jaxba.geometry import CAMERAS, Cauchy, GemanMcClure, Linear, Pose
 from jaxba.scene import Block, CommonOffset, Photo, Reference
 from jaxba.sfm._control import CONTROL_LOSS, ControlPart
 from jaxba.sfm._intrinsics import NaturalIntrinsics, natural_intrinsics
-from jaxba.sfm._measured import LEAST_POSITIONS, used_positions
+from jaxba.sfm._measured import LEAST_POSITIONS, flights_of, used_positions
 
 POSITION_LOSS = GemanMcClure(4.0)
 _ASPECT_STD = 5e-4
@@ -74,7 +75,7 @@ def to_problem(
     - `let_go`: times the residual at which a position's loss lets it go.
     - `held`: names of the camera model's parameters that stay as they are.
     - `control`: points and observations that follow the block's own. `common`: what positions are off in common, which
-      is an unknown then.
+      is an unknown then. What those of each flight are off, where flights are told apart, always is.
 
     >>> import numpy as np
     >>> from jaxba.sfm import free_parameters
@@ -112,8 +113,9 @@ def to_problem(
         std = np.concatenate([std, np.full(len(control.observation_image), control.std_px)])
         image = np.concatenate([image, control.observation_image])
         point = np.concatenate([point, number[control.observation_point]])
-    if common is not None:
-        priors.append(PositionOffsetPrior(xyz=np.zeros((1, 3)), std_m=common.std_m[None]))
+    offsets = _offsets(block, reference, common)
+    if offsets is not None:
+        priors.append(PositionOffsetPrior(xyz=np.zeros(offsets.std_m.shape), std_m=offsets.std_m))
     problem = Problem.build(
         Pose(block.quaternion, block.translation_m),
         model.from_parameters(inside),
@@ -125,10 +127,33 @@ def to_problem(
     )
     if block.camera_model == "OPENCV":
         problem = problem.fix(intrinsics=["k3"])
-    if common is not None:
+    if offsets is not None:
         free = dataclasses.replace(problem.free, position_offset=np.array(True))
-        problem = dataclasses.replace(problem, position_offset=common.start_m[None], free=free)
+        problem = dataclasses.replace(problem, position_offset=offsets.start_m, free=free)
     return dataclasses.replace(problem, lower=natural.lower, upper=natural.upper)
+
+
+class _Offsets(NamedTuple):
+    """Offsets of positions, a row each: start values and sigmas."""
+
+    start_m: Float[np.ndarray, "offsets 3"]
+    std_m: Float[np.ndarray, "offsets 3"]
+
+
+def _offsets(block: Block, reference: Reference, common: CommonOffset | None) -> _Offsets | None:
+    """Return what positions have in common as unknowns: all of them, or those of each flight, as the block lies."""
+    flights = flights_of(block, reference)
+    if flights is None:
+        return None if common is None else _Offsets(common.start_m[None], common.std_m[None])
+    used = used_positions(block, reference)
+    off = reference.xyz_m[block.image_index[used]] - block.centers_m[used]
+    start_m = np.zeros((len(flights[0]), 3))
+    for number in range(len(start_m)):
+        of_flight = off[flights[1] == number]
+        known = np.isfinite(of_flight).any(axis=0)
+        start_m[number, known] = np.nanmedian(of_flight[:, known], axis=0)
+    assert reference.flight_std_m is not None  # flights are told apart
+    return _Offsets(start_m, np.full(start_m.shape, reference.flight_std_m))
 
 
 def with_solution(block: Block, solution: Solution) -> Block:
@@ -194,7 +219,16 @@ def _position_priors(
     nowhere = ~np.isfinite(std).any(axis=0)  # no photo has a height: they stay where they start
     xyz[:, nowhere], std[:, nowhere] = anchor.centers_m[rows][:, nowhere], weak
     loss = GemanMcClure(POSITION_LOSS.f_scale * let_go)
-    return (PositionPrior(image_index=rows.astype(np.int32), xyz=np.nan_to_num(xyz), std_m=std, loss=loss),)
+    flights = flights_of(anchor, reference)
+    return (
+        PositionPrior(
+            image_index=rows.astype(np.int32),
+            xyz=np.nan_to_num(xyz),
+            std_m=std,
+            loss=loss,
+            offset_weights=None if flights is None else np.eye(len(flights[0]))[flights[1]],
+        ),
+    )
 
 
 def _sigma(reference: Reference, index: np.ndarray, scale: np.ndarray | None) -> Float[np.ndarray, "n 3"]:

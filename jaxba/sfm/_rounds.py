@@ -173,7 +173,9 @@ class Rounds:
             fits &= ~solution.report.dropped.observations
         if not fits[:num_own].all():
             block = with_observations(block, fits[:num_own])
-            problem = problem_of(block, control)
+            problem = dataclasses.replace(
+                problem_of(block, control), position_offset=np.asarray(solution.position_offset)
+            )
             error_px = reprojection_errors(problem)
         error_px = error_px[: block.num_observations]
         common_m = np.zeros(3) if common is None else np.asarray(solution.position_offset)[0]

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxba.geometry import umeyama
 from jaxba.scene import Block, Control, LocalFrame, Photo, Reference, Tracks, ViewGraph
+from jaxba.sfm import transformed
 from jaxba.simulation.synthetic import Survey, uav_block
 
 FRAME = LocalFrame(
@@ -112,7 +114,10 @@ def true_block(simulated: Simulated) -> Block:
 def measured_anew(
     simulated: Simulated, rng: np.random.Generator, gnss_std_m: tuple[float, float, float], std_px: float = 0.5
 ) -> Simulated:
-    """Return the same flight with errors of pixels and positions drawn anew: as many of each, in the same photos."""
+    """Return the same flight with errors of pixels and positions drawn anew: as many of each, in the same photos.
+
+    The block starts where its positions put it, as after the start stage.
+    """
     truth = simulated.survey.truth
     centers = np.asarray(truth.poses.center)
     std_m = np.tile(gnss_std_m, (len(centers), 1))
@@ -120,7 +125,9 @@ def measured_anew(
         simulated.reference, frame=FRAME, xyz_m=centers + std_m * rng.normal(size=centers.shape), std_m=std_m
     )
     tracks = replace(simulated.tracks, xy_px=truth.xy_px + std_px * rng.normal(size=truth.xy_px.shape))
-    return replace(simulated, reference=reference, tracks=tracks)
+    onto = umeyama(simulated.block.centers_m, reference.xyz_m)
+    block = simulated.block if onto is None else transformed(simulated.block, onto)
+    return replace(simulated, reference=reference, tracks=tracks, block=block)
 
 
 def spread_control(

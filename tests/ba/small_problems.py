@@ -152,7 +152,7 @@ def small_problem(
             antennas[::-1],
             gnss_std_m[::-1],
             prior_loss,
-            (every_image[::-1] * 2 // num_images * position_offset).astype(np.int32),
+            of_flights(every_image[::-1], num_images) if position_offset else None,
         ),
         AttitudePrior(
             with_attitude,
@@ -189,12 +189,16 @@ def small_problem(
     return eqx.tree_at(lambda p: (p.position_offset, p.free.position_offset), problem, offset)
 
 
+def of_flights(images: np.ndarray, num_images: int) -> np.ndarray:
+    """Weights of two position offsets: of the first and the second half of the images."""
+    return np.eye(2)[np.asarray(images) * 2 // num_images]
+
+
 def two_flights(problem: Problem) -> Problem:
     """Return a problem with one position offset with two, of the first and the second half of its images."""
     position, offset = problem.prior("position"), problem.prior("position_offset")
-    flight = np.asarray(position.image_index) * 2 // problem.num_images
     changed = {
-        "position": dataclasses.replace(position, offset_index=flight.astype(np.int32)),
+        "position": dataclasses.replace(position, offset_weights=of_flights(position.image_index, problem.num_images)),
         "position_offset": PositionOffsetPrior(
             np.repeat(offset.xyz, 2, axis=0), np.repeat(offset.std_m, 2, axis=0) * [[1.0], [0.5]]
         ),

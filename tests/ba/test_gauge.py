@@ -81,7 +81,12 @@ def given(problem: Problem, *priors: object, lever_arm: bool = False, position_o
 
 def of_flights(prior: PositionPrior) -> PositionPrior:
     """Every second position has the second offset."""
-    return dataclasses.replace(prior, offset_index=np.asarray(prior.image_index, np.int32) % 2)
+    return dataclasses.replace(prior, offset_weights=np.eye(2)[np.asarray(prior.image_index) % 2])
+
+
+def only_first(prior: PositionPrior) -> PositionPrior:
+    """No position has the second offset."""
+    return dataclasses.replace(prior, offset_weights=np.tile([1.0, 0.0], (len(prior.xyz), 1)))
 
 
 CASES = {
@@ -133,7 +138,7 @@ CASES = {
         tuple(f"translation {a} + position offset 0 {a} + position offset 1 {a}" for a in "xyz"),
     ),
     "offset of a flight without positions": (
-        lambda p: given(p, positions(p), control(p, [3, 8, 20]), position_offset=2),
+        lambda p: given(p, only_first(positions(p)), control(p, [3, 8, 20]), position_offset=2),
         ("position offset 1 x", "position offset 1 y", "position offset 1 z"),
     ),
     "idle lever arm": (
@@ -196,9 +201,9 @@ def prior_rows(prior: object, problem: Problem) -> np.ndarray:
             assert not np.any(problem.lever_arm)
             row[:, 6 * i + 3 : 6 * i + 6], row[:, arm : arm + 3] = -rotation[i].T, rotation[i].T
             if len(problem.position_offset):
-                number = 0 if prior.offset_index is None else prior.offset_index[list(prior.image_index).index(i)]
-                at = arm + 3 + 3 * number
-                row[:, at : at + 3] = np.eye(3)
+                given = prior.offset_weights
+                weights = np.ones(len(problem.position_offset)) if given is None else given[list(index).index(i)]
+                row[:, arm + 3 :] = np.kron(weights, np.eye(3))
         elif isinstance(prior, AttitudePrior):
             row[:, 6 * i : 6 * i + 3] = np.eye(3)
         elif isinstance(prior, ControlPointPrior):

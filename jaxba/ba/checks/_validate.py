@@ -243,10 +243,8 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
                 f"prior {prior.name}: {label(int(twice[0]))} has more than one row{_more(twice)}; keep one of them."
             )
         label = lambda row: of_kind(int(index[row]))  # noqa: E731
-    at_least_one = {**sizes, "offsets": max(sizes["offsets"], 1)}  # without offsets, rows have the first one
     for name in indices[1:]:
-        into = f"{name.removesuffix('_index')}s"
-        _check_index(problem, f"prior {prior.name}: {name}", values[name], "rows", into, at_least_one)
+        _check_index(problem, f"prior {prior.name}: {name}", values[name], "rows", f"{name[:-6]}s", sizes)
     for field in fields:
         if field.name.endswith("_index"):
             continue

@@ -22,8 +22,8 @@ class PositionPrior(AbstractPrior):
     """Measured antenna positions of some images.
 
     - `xyz`: metres, world. `std_m`: sigma an axis; infinite where an axis is not measured.
-    - `offset_index`: which of the problem's position offsets each has, such as that of its flight; the first where it
-      is left out.
+    - `offset_weights`: by which each of the problem's position offsets counts in each row: 1 for that of all or of its
+      flight, a time for a drift; all count by 1 where it is left out.
     - `loss`: robust against single bad fixes, e.g. `Cauchy(3.0)`, in units of sigma.
     """
 
@@ -33,19 +33,14 @@ class PositionPrior(AbstractPrior):
     xyz: Float[Array | np.ndarray, "rows 3"]
     std_m: Float[Array | np.ndarray, "rows 3"]
     loss: AbstractLoss = Linear()
-    offset_index: Int[Array | np.ndarray, " rows"] | None = None
+    offset_weights: Float[Array | np.ndarray, "rows offsets"] | None = None
 
-    def _index(self) -> Int[Array | np.ndarray, " rows"]:
-        return np.zeros(len(self.image_index), np.int32) if self.offset_index is None else self.offset_index
+    def _weights(self, count: int) -> Float[Array | np.ndarray, "rows offsets"]:
+        return np.ones((len(self.image_index), count)) if self.offset_weights is None else self.offset_weights
 
     def offset(self, offsets: Float[Array | np.ndarray, "offsets 3"]) -> Float[Array | np.ndarray, "rows 3"]:
         """Return the offset of each row, metres, world; zero where a problem has none."""
-        if len(offsets) == 0:
-            return np.zeros((len(self.image_index), 3))
-        index = self._index()
-        if isinstance(offsets, np.ndarray) and isinstance(index, np.ndarray):
-            return offsets[index]
-        return rows_of(offsets, index)
+        return self._weights(len(offsets)) @ offsets
 
     def residual(self, unknowns: Unknowns) -> Float[Array, "3 rows"]:
         rotation = rotation_rows(unknowns.poses.rotation, jnp.asarray(self.image_index))
@@ -59,8 +54,7 @@ class PositionPrior(AbstractPrior):
         transposed = jnp.swapaxes(rotation, 0, 1) / jnp.asarray(self.std_m).T[:, None]
         x, y, z = unknowns.lever_arm
         by_offset = jnp.eye(3, dtype=transposed.dtype)[:, :, None] / jnp.asarray(self.std_m).T[:, None]
-        index = jnp.asarray(self._index())
-        has = [index == number for number in range(len(unknowns.position_offset))]
+        weights = jnp.asarray(self._weights(len(unknowns.position_offset)))
         # R^T [l]_x, column by column
         turn = [
             transposed[:, 1] * z - transposed[:, 2] * y,
@@ -70,5 +64,5 @@ class PositionPrior(AbstractPrior):
         return Rows(
             residual=self.residual(unknowns),
             pose=JacobianBlock(self.image_index, jnp.concatenate([jnp.stack(turn, axis=1), -transposed], axis=1)),
-            antenna=jnp.concatenate([transposed, *[by_offset * each for each in has]], axis=1),
+            antenna=jnp.concatenate([transposed, *[by_offset * each for each in weights.T]], axis=1),
         )

@@ -69,9 +69,10 @@ def position_spread(problem: Problem, prior: PositionPrior) -> Spread:
 
     A few positions do not tell how their errors are spread: they are taken as normal, as their sigmas say. Weights of
     positions that are as good as any make the covariance larger than it is: for normal errors and `POSITION_LOSS` by a
-    third, where the estimate loses 7%. With w the mean weight of the positions that the loss has not let go,
+    third, where the estimate loses 7%. With w the mean weight of the positions that the loss has not let go, and w'
+    the mean of their own psi',
 
-        scatter^2 = w E psi^2 / (E psi')^2,   yielding^2 = w / E psi'
+        scatter^2 = w E psi^2 / (E psi')^2,   yielding^2 = w / w'
 
     expectations of normal errors as in `spread`, over three coordinates.
     """
@@ -79,17 +80,18 @@ def position_spread(problem: Problem, prior: PositionPrior) -> Spread:
         center = np.asarray(problem.poses.center)[prior.image_index]
         moved = center + prior.offset(np.asarray(problem.position_offset)) - prior.xyz
         squared = np.sum((moved / prior.std_m) ** 2, axis=1)
-        weight = np.asarray(prior.loss.derivatives(jnp.asarray(squared))[1])
+        weight, bent = (np.asarray(part) for part in prior.loss.derivatives(jnp.asarray(squared))[1:])
         z = (np.arange(_STEPS) + 0.5) * _FARTHEST / _STEPS  # over sigma; chi's density of three degrees follows
         of_normal, change = (np.asarray(part) for part in prior.loss.derivatives(jnp.asarray(z**2))[1:])
     share = z**2 * np.exp(-(z**2) / 2)
     share /= share.sum()
     slope = float(share @ (of_normal + 2 / 3 * z**2 * change))
-    kept = weight[weight > _LET_GO]
-    if slope <= 0 or not len(kept):
+    kept = weight > _LET_GO
+    if slope <= 0 or not kept.any():
         return Spread()
-    mean, squares = float(kept.mean()), float(share @ (of_normal * z) ** 2) / 3
-    return Spread(np.sqrt(mean * squares) / slope, np.sqrt(mean / slope))
+    mean, squares = float(weight[kept].mean()), float(share @ (of_normal * z) ** 2) / 3
+    own = float(np.mean((weight + 2 / 3 * squared * bent)[kept]))
+    return Spread(np.sqrt(mean * squares) / slope, np.sqrt(mean / own) if own > 0 else 1.0)
 
 
 def weighed(problem: Problem, times: float, num_own: int, *, yielding: bool = False) -> Problem:

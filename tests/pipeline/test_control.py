@@ -1,5 +1,6 @@
 """The control stage: roles, scale of marks, heights, places; what cannot be used is named, what is wrong is refused."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -377,3 +378,22 @@ def test_marks_of_larger_photos_are_turned_and_scaled():
     np.testing.assert_allclose(made.control.mark_xy_px, stored)
     made = run("\n".join(["EPSG:32615", *map(" ".join, large)]), of=of, mark_orientation="exif", mark_width_px=3000)
     np.testing.assert_allclose(made.control.mark_xy_px, stored)
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5])
+def test_marks_set_in_smaller_photos_are_refused_with_their_width(factor: float):
+    # breaks where marks within the edges are taken for good
+    of = looking_down(1)
+    text, stored = marked_down(1, of)
+    rows = [line.split() for line in text.splitlines()[1:]]
+    small = [[*row[:3], str(factor * float(row[3])), str(factor * float(row[4])), *row[5:]] for row in rows]
+    given = "\n".join(["EPSG:32615", *map(" ".join, small)])
+    width = of[0].width_px
+    with pytest.raises(JaxbaError, match=r"in photos of some \d+ px width they would lie") as error:
+        run(given, of=of)
+    (found,) = re.findall(r"of some (\d+) px width", str(error.value))
+    assert float(found) == pytest.approx(factor * width, rel=0.05)
+    made = run(given, of=of, mark_width_px=round(factor * width))
+    np.testing.assert_allclose(made.control.mark_xy_px, stored)
+    made = run(given, of=of, mark_width_px=width)
+    np.testing.assert_allclose(made.control.mark_xy_px, factor * stored)

@@ -31,7 +31,7 @@ from jaxba.ba._tables import (
     points_table,
     prior_table,
 )
-from jaxba.ba._variance_components import VarianceComponent, reweighted, variance_components
+from jaxba.ba._variance_components import VarianceComponent, components_by, reweighted, variance_components
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS
 from jaxba.geometry import AbstractLoss, Linear, require_number
 
@@ -43,6 +43,7 @@ class Statistics:
     - `covariance`: of the unknowns. `problem`: what they are of.
     - `observations`: of the pixels, a row for each of the problem's. `priors`: of each prior, in the problem's order.
     - `components`: how each kind of measurement scatters beside its sigmas.
+    - `loss`: of the observations.
     """
 
     covariance: Covariance
@@ -50,6 +51,7 @@ class Statistics:
     observations: RowStatistics
     priors: tuple[RowStatistics, ...]
     components: tuple[VarianceComponent, ...]
+    loss: AbstractLoss
 
     @property
     def p_value(self) -> float:
@@ -63,15 +65,42 @@ class Statistics:
             return np.nan
         return float(chdtrc(covariance.redundancy, covariance.variance_factor * covariance.redundancy))
 
-    def reweighted(self, most: float = 10.0) -> Problem:
+    def reweighted(self, most: float = 10.0, components: Sequence[VarianceComponent] | None = None) -> Problem:
         """Return the problem with the sigmas that the variance components show, where enough is known of them.
 
         One step of an iteration: solve it, and take its statistics again. Three steps are mostly enough.
 
-        - `most`: times that a sigma may grow, or shrink, at once.
+        - `most`: times that a sigma may grow, or shrink, at once. `components`: those of the statistics if None; others
+          such as `components_by` gives must not share rows.
         """
         require_number("reweighted: most", most, 1.0, np.finfo(float).max, "give 1 or more, such as 10")
-        return reweighted(self.problem, self.components, most)
+        return reweighted(self.problem, self.components if components is None else components, most)
+
+    def components_by(
+        self, labels: Sequence[Any] | np.ndarray, group: str = "observations"
+    ) -> tuple[VarianceComponent, ...]:
+        """Return variance components of a group's rows by label: of each camera, each flight, each day.
+
+        - `labels`: one a row of the group, `observations` or a prior's name. Positions and control points have a
+          component across and one up.
+
+        Raises `JaxbaError` where their number is wrong, and where the problem has no such group.
+
+        >>> import jaxba
+        >>> problem = jaxba.synthetic.uav_block(8, num_cameras=2).problem
+        >>> found = jaxba.statistics(jaxba.solve(problem).apply(problem))
+        >>> camera = problem.camera_index[problem.observations.image_index]
+        >>> [component.name for component in found.components_by(camera)]
+        ['observations 0', 'observations 1']
+        """
+        rows = self.observations if group == "observations" else self.prior(group)
+        labels = np.asarray(labels)
+        if labels.shape != (len(rows.weight),):
+            raise JaxbaError(
+                f"components_by: {labels.shape} labels for the {len(rows.weight)} rows of {group}; give one a row."
+            )
+        prior = self.problem.prior(group)
+        return components_by(rows, self.loss if prior is None else prior.loss, labels)
 
     def observations_frame(self) -> DataFrame:
         """Return the table of observations, a row for each of the problem's; its columns: `ba/_tables.py`."""
@@ -150,7 +179,7 @@ def statistics(
     observations = row_statistics("observations", std_px, _weight(loss, everywhere), everywhere)
     priors = _of_priors(problem, leverages[1:])
     components = variance_components(problem, loss, observations, priors)
-    return Statistics(found, problem, observations, priors, components)
+    return Statistics(found, problem, observations, priors, components, loss)
 
 
 def prior_statistics(

@@ -73,13 +73,26 @@ def variance_components(
     ]
     for prior, rows in zip(problem.priors, priors, strict=True):
         every = np.ones(len(rows.weight), bool)
-        if prior.name in ("position", "control"):
-            kinds.append((f"{prior.name} horizontal", prior.loss, rows, every, _HORIZONTAL))
-            kinds.append((f"{prior.name} vertical", prior.loss, rows, every, _VERTICAL))
-        else:
-            kinds.append((prior.name.replace("_", " "), prior.loss, rows, every, [True] * rows.std.shape[1]))
+        kinds += [(name, prior.loss, rows, every, axes) for name, axes in _kinds_of(rows)]
     found = (_component(name, loss, rows, mine, np.array(axes)) for name, loss, rows, mine, axes in kinds)
     return tuple(component for component in found if component.count)
+
+
+def components_by(rows: RowStatistics, loss: AbstractLoss, labels: np.ndarray) -> tuple[VarianceComponent, ...]:
+    """Return those of a group's rows by label."""
+    found = [
+        _component(f"{name} {label}", loss, rows, labels == label, np.array(axes))
+        for label in np.unique(labels)
+        for name, axes in _kinds_of(rows)
+    ]
+    return tuple(component for component in found if component.count)
+
+
+def _kinds_of(rows: RowStatistics) -> list[tuple[str, list[bool]]]:
+    """Return the names of a group's kinds, and the components of a row that each has."""
+    if rows.name in ("position", "control"):
+        return [(f"{rows.name} horizontal", _HORIZONTAL), (f"{rows.name} vertical", _VERTICAL)]
+    return [(rows.name.replace("_", " "), [True] * rows.std.shape[1])]
 
 
 def reweighted(problem: Problem, components: Sequence[VarianceComponent], most: float) -> Problem:

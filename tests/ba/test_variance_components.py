@@ -133,3 +133,29 @@ def test_weights_are_estimated_in_the_adjustment_that_uses_them() -> None:
     held = jaxba.solve_and_reweight(problem, most=1.2, rounds=3)
     assert "position vertical" in held.at_limit
     assert all(1 / 1.2 - 1e-9 < times < 1.2 + 1e-9 for times in held.times.values())
+
+
+def test_components_by_label_tell_two_cameras_and_two_flights_apart() -> None:
+    problem = jaxba.synthetic.uav_block(20, seed=3, points_per_image=30.0, num_control=14).problem
+    image = problem.observations.image_index
+    camera, flight = np.arange(20) % 2, np.where(np.arange(20) < 10, "first", "second")
+    std_px = np.where(camera[image] == 0, problem.observations.std_px, problem.observations.std_px / 2)
+    position = problem.prior("position")
+    std_m = np.where(flight[position.image_index][:, None] == "first", 1.0, 0.5) * position.std_m  # type: ignore[union-attr]
+    priors = tuple(dataclasses.replace(p, std_m=std_m) if p is position else p for p in problem.priors)  # type: ignore[call-arg]
+    observations = dataclasses.replace(problem.observations, std_px=std_px)
+    wrong = dataclasses.replace(problem, observations=observations, priors=priors)
+    found = statistics_of(wrong, Linear())
+    by_camera = found.components_by(camera[image])
+    by_flight = found.components_by(flight[position.image_index], "position")  # type: ignore[union-attr]
+    assert [c.name for c in by_flight] == [
+        f"position {axis} {of}" for of in ("first", "second") for axis in ("horizontal", "vertical")
+    ]
+    assert sum(c.redundancy for c in by_camera) == pytest.approx(np.nansum(found.observations.redundancy))
+    # half the sigma is four times the variance
+    assert by_camera[1].factor / by_camera[0].factor == pytest.approx(4.0, rel=4 * np.sqrt(4 / by_camera[0].redundancy))
+    assert by_flight[2].factor > 2 * by_flight[0].factor
+    mended = found.reweighted(1e3, by_camera).observations.std_px
+    assert np.median(mended[camera[image] == 1]) == pytest.approx(np.median(mended[camera[image] == 0]), rel=0.1)
+    with pytest.raises(JaxbaError, match=r"components_by: \(3,\) labels for the 20 rows of position; give one a row"):
+        found.components_by([1, 2, 3], "position")

@@ -152,10 +152,12 @@ def test_components_by_label_tell_two_cameras_and_two_flights_apart() -> None:
         f"position {axis} {of}" for of in ("first", "second") for axis in ("horizontal", "vertical")
     ]
     assert sum(c.redundancy for c in by_camera) == pytest.approx(np.nansum(found.observations.redundancy))
-    # half the sigma is four times the variance
-    assert by_camera[1].factor / by_camera[0].factor == pytest.approx(4.0, rel=4 * np.sqrt(4 / by_camera[0].redundancy))
-    assert by_flight[2].factor > 2 * by_flight[0].factor
-    mended = found.reweighted(1e3, by_camera).observations.std_px
-    assert np.median(mended[camera[image] == 1]) == pytest.approx(np.median(mended[camera[image] == 0]), rel=0.1)
+    # half the sigma is four times the variance; the first step does not reach it, since wrong weights share it out
+    assert by_camera[1].factor > 2 * by_camera[0].factor and by_flight[2].factor > 2 * by_flight[0].factor
+    for _ in range(3):
+        found = statistics_of(found.reweighted(1e3, found.components_by(camera[image])), Linear())
+    std_px = found.problem.observations.std_px
+    one, other = (float(np.median(std_px[camera[image] == k])) for k in (0, 1))
+    assert one == pytest.approx(other, rel=0.1) and one == pytest.approx(problem.observations.std_px[0], rel=0.1)
     with pytest.raises(JaxbaError, match=r"components_by: \(3,\) labels for the 20 rows of position; give one a row"):
         found.components_by([1, 2, 3], "position")

@@ -83,7 +83,8 @@ def test_the_loss_is_that_of_the_options_and_else_that_of_the_file(
     assert len(set(costs.values())) == 4
     assert costs["--loss", "linear"] == float(jaxba.solve(survey.problem, max_nfev=3).final_cost)
     found = json.loads(cli("info", path, "--json")[1])
-    assert found["loss"] == {"name": "barron", "f_scale": 2.0} and "barron of scale 2" in cli("info", path)[1]
+    assert found["loss"] == {"name": "barron", "alpha": 0.5, "f_scale": 2.0}
+    assert "barron of scale 2, of shape 0.5" in cli("info", path)[1]
 
 
 def test_json_tells_what_solve_returns(cli: Cli, tile: Path, survey: jaxba.synthetic.Survey):

@@ -220,6 +220,8 @@ def _inputs(problem: Problem, loss: AbstractLoss) -> dict[str, _Input]:
         sigmas = [f.name for f in dataclasses.fields(prior) if f.name.startswith("std")]
         for field in dataclasses.fields(prior):
             value = getattr(prior, field.name)
+            if value is None:
+                continue
             if field.name == "loss":
                 if not isinstance(value, Linear):
                     found[f"{prior.name} loss scale"] = _Input(

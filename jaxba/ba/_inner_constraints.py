@@ -22,6 +22,7 @@ from jaxba.ba._unknowns import Step
 from jaxba.ba.checks import free_directions
 from jaxba.ba.groups import ControlPointPrior
 
+_LEAST_POINTS = 10
 _HELD = 1e-3  # sigma of the seven coordinates over the block's rms extent; the result does not depend on it
 
 
@@ -91,7 +92,13 @@ def free_block(label: str, problem: Problem) -> FreeBlock:
     root = np.linalg.cholesky(np.einsum("nij,nik->jk", points, points))
     poses, points = (np.swapaxes(np.linalg.solve(root, np.swapaxes(d, 1, 2)), 1, 2) for d in (poses, points))
     xyz = np.asarray(problem.points, float)
-    corners = _corners(xyz, np.flatnonzero(problem.free.points))
+    seen = np.flatnonzero(problem.free.points)
+    corners = _corners(xyz, seen) if len(seen) >= _LEAST_POINTS else seen[:0]
+    if len(np.unique(corners)) < 3:
+        raise JaxbaError(
+            f'{label}: datum "inner" needs {_LEAST_POINTS} points or more that lie apart and off one line; there are '
+            f'{len(seen)}. Leave the datum at "priors".'
+        )
     std_m = np.full((3, 3), np.inf)
     std_m.reshape(-1)[_best_rows(points[corners].reshape(9, 7))] = _HELD * size
     prior = ControlPointPrior(point_index=corners.astype(np.int32), xyz=xyz[corners], std_m=std_m)

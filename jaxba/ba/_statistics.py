@@ -95,6 +95,8 @@ class Statistics:
         """
         rows = self.observations if group == "observations" else self.prior(group)
         labels = np.asarray(labels)
+        if labels.dtype.kind not in "iufUSb" or (labels.dtype.kind == "f" and np.isnan(labels).any()):
+            raise JaxbaError("components_by: labels are to be numbers or texts, one a row, none of them missing.")
         if labels.shape != (len(rows.weight),):
             raise JaxbaError(
                 f"components_by: {labels.shape} labels for the {len(rows.weight)} rows of {group}; give one a row."

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba._projection import camera_centers
 from jaxba.ba._reliability import RowStatistics
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def images_table(problem: Problem, covariance: "Covariance") -> DataFrame:
     turns = np.sqrt(np.maximum(np.einsum("nii->ni", covariance.poses[:, :3, :3]), 0.0))
     numbers = np.arange(problem.num_images)
     columns = {"image": _images(problem, numbers), "camera": np.asarray(problem.camera_index)}
-    columns |= _places(np.asarray(problem.poses.center), covariance.centers)
+    columns |= _places(camera_centers(problem.poses), covariance.centers)
     columns |= {f"std_rot_{axis}_rad": turns[:, k] for k, axis in enumerate("xyz")}
     seen = np.asarray(problem.observations.image_index)
     columns["num_observations"] = np.bincount(seen, minlength=problem.num_images)
@@ -108,7 +109,7 @@ def pairs_table(problem: Problem) -> DataFrame:
     """Return a row for each pair of images that have points in common, by number of the first, then of the second."""
     import pandas as pd
 
-    seen, centers = problem.observations, np.asarray(problem.poses.center)
+    seen, centers = problem.observations, camera_centers(problem.poses)
     order = np.lexsort((np.asarray(seen.image_index), np.asarray(seen.point_index)))
     image, point = np.asarray(seen.image_index)[order], np.asarray(seen.point_index)[order]
     rays = np.asarray(problem.points, float)[point] - centers[image]

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from jaxba.ba import AbstractPrior, Prepared, Problem, Unknowns, free_gauge, prepare, quality
-from jaxba.cli._result import intrinsics, name_of_loss
+from jaxba.cli._result import intrinsics, loss_parameters, name_of_loss
 from jaxba.cli._text import first_of, gauge_text, many, table, to_json
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.geometry import CAMERAS
@@ -24,7 +24,7 @@ def run(file: Path, *, as_json: bool) -> int:
     """Print what a file holds; return the exit code."""
     held = problem_of_bytes(read_bytes(file), str(file))
     use_compilation_cache()
-    loss = None if held.loss is None else {"name": name_of_loss(held.loss), "f_scale": float(held.loss.f_scale)}
+    loss = None if held.loss is None else {"name": name_of_loss(held.loss), **loss_parameters(held.loss)}
     found = {"input": str(file), **facts(held.problem), "loss": loss}
     print(to_json(found) if as_json else text(found))
     return 0
@@ -135,10 +135,7 @@ def text(found: dict[str, Any]) -> str:
             ("free", _free_text(found)),
             ("bounds", [f"{n} {b['lower']:.6g} to {b['upper']:.6g}" for n, b in found["bounds"].items()]),
             ("priors", [_prior_text(prior) for prior in found["priors"]] or "none"),
-            (
-                "loss",
-                "{name} of scale {f_scale:.4g}, that of the file".format(**found["loss"]) if found["loss"] else [],
-            ),
+            ("loss", _loss_text(found["loss"]) if found["loss"] else []),
             ("left out", found["dropped"]),
             ("cost", ", ".join(f"{name} {cost:.6g}" for name, cost in found["initial_costs"].items())),
             ("errors", f"median {found['median_error_px']:.3f} px, MAD {found['mad_px']:.3f} px at the start values"),
@@ -164,6 +161,11 @@ def _prior_text(prior: dict[str, Any]) -> str:
     )
     loss = "" if prior["loss"] == "linear" else f" ({prior['loss']} loss)"
     return f"{prior['name']}: {many(prior['rows'], 'row')}, {sigmas}{loss}"
+
+
+def _loss_text(loss: dict[str, Any]) -> str:
+    shape = f", of shape {loss['alpha']:.4g}" if "alpha" in loss else ""
+    return f"{loss['name']} of scale {loss['f_scale']:.4g}{shape}, that of the file"
 
 
 def _free_text(found: dict[str, Any]) -> list[str]:

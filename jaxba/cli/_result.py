@@ -52,6 +52,11 @@ def name_of_loss(loss: AbstractLoss) -> str:
     return next(name for name, kind in LOSSES.items() if type(loss) is kind)
 
 
+def loss_parameters(loss: AbstractLoss) -> dict[str, float]:
+    """Return the numbers of a loss by name."""
+    return {field.name: float(getattr(loss, field.name)) for field in dataclasses.fields(loss)}
+
+
 def facts(run: Run) -> dict[str, object]:
     """Return everything about a run by name, for `--json`.
 

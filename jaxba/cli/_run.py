@@ -17,7 +17,7 @@ from jaxba.cli._text import first_of, labelled, many, to_json, wrapped
 from jaxba.engine import changed
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.pipeline import Event, Run, run_pipeline
-from jaxba.report import accuracy_row, control_rows
+from jaxba.report import accuracy_row, control_rows, flight_lines
 
 _SUMMARY_LABEL = 12
 
@@ -142,4 +142,5 @@ def _result_rows(adjust: dict[str, Any], control: list[tuple[str, str]]) -> list
         used = {axis: rms for axis, rms in axes if rms is not None and math.isfinite(rms)}  # heights may not be used
         figures = ", ".join(f"{rms:.2f}" for rms in used.values())
         rows.append(("GNSS fit", f"RMS {figures} m {', '.join(used)} over {adjust['num_gnss']} positions"))
-    return [*rows, *control, *labelled("findings", adjust["findings"])]
+    flights = flight_lines(adjust.get("flights", []))
+    return [*rows, *labelled("flights", flights), *control, *labelled("findings", adjust["findings"])]

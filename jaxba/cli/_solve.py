@@ -123,7 +123,7 @@ def make_loss(options: SolveOptions, own: AbstractLoss | None = None) -> Abstrac
     """
     check_loss_options(options)
     loss = own or Linear()
-    if options.loss is not None:
+    if options.loss is not None and not isinstance(loss, LOSSES[options.loss]):
         loss = LOSSES[options.loss](f_scale=1.0)
     if options.f_scale is not None:
         loss = dataclasses.replace(loss, f_scale=options.f_scale)

@@ -152,6 +152,11 @@ def _checked(arrays: Mapping[str, np.ndarray], label: str) -> dict[str, np.ndarr
             "of camera_parameters, or add zeros for those that are missing."
         )
     checked = check_arrays(arrays, specs, {"parameters": len(names)}, label)
+    alone = [spec.name for spec in loss_specs(OBSERVATION_LOSS)[1:] if spec.name in arrays]
+    if alone and OBSERVATION_LOSS not in arrays:
+        raise JaxbaError(
+            f"{label}: {alone[0]} is given, but no {OBSERVATION_LOSS}; name the loss, or remove the array."
+        )
     for prefix in (OBSERVATION_LOSS, *map(loss_of, PRIORS)):
         if prefix not in checked:
             continue

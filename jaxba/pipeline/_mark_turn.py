@@ -102,7 +102,9 @@ def other_size(
     away_px = [float(np.median(np.hypot(*(f * xy_px - expected_px)[known].T))) for f in (1.0, *factors)]
     best = int(np.argmin(away_px[1:]))
     factor, scaled_px, unscaled_px = float(factors[best]), away_px[1 + best], away_px[0]
-    if abs(np.log(factor)) < np.log(_OTHER_SIZE) or scaled_px > min(_FITS * side_px, _CLEARLY * unscaled_px):
+    if abs(np.log(factor)) < np.log(_OTHER_SIZE) or unscaled_px < _FITS * side_px:
+        return None
+    if scaled_px > min(_FITS * side_px, _CLEARLY * unscaled_px):
         return None
     return factor, scaled_px, unscaled_px
 

@@ -129,7 +129,7 @@ def marks_in_photos(
         notes.append(f"{name}: marks are turned back by {how} (control.mark_orientation={orientation}).")
     xy_px, scaled = _on_grid(given, turn)
     notes += scaled
-    if orientation == "auto" and mark_width_px is None and not scaled:
+    if orientation == "auto" and np.array_equal(xy_px, on_stored_grid(given.xy_px, given.size_px, turn)):
         _refuse_other_size(given, xy_px, seen_px)
     outside = _outside(xy_px, given.size_px)
     for k in np.flatnonzero(outside):
@@ -202,8 +202,8 @@ def _refuse_other_size(
         f"{given.name}: marks count on the photos' pixel grid, {width:.0f} px wide, and there they lie "
         f"{unscaled_px:.0f} px from where positions and attitudes see the points (median); set in photos of some "
         f"{width / factor:.0f} px width they would lie {away_px:.0f} px from there. Give the width of the photos that "
-        f"they were set in, such as --set control.mark_width_px={width / factor:.0f}, or that of these photos "
-        f"(control.mark_width_px={width:.0f}) to take them as they are."
+        f"they were set in, such as --set control.mark_width_px={width / factor:.0f}, or take them as they are "
+        "(control.mark_orientation=stored)."
     )
 
 

@@ -161,9 +161,9 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
     )
     sigmas = sfm.uncertainty(adjusted, reference)
     flights = sfm.flight_offsets(adjusted, sigmas, reference)
-    reference = sfm.without_offsets(reference, flights)
     control = dataclasses.replace(inputs.control, mark_std_px=adjusted.mark_std_px)
     controlled = sfm.apply_control(adjusted, sigmas, control, reference)
+    reference = sfm.without_offsets(reference, flights)
     block = controlled.block
     fit = sfm.gnss_fit(block, reference)
     sigmas = controlled.sigmas
@@ -223,8 +223,7 @@ def lines(outputs: Outputs, told: Told) -> list[str]:
             f"Variance factor {factor:.2f}: residuals scatter by {np.sqrt(factor):.2f} times the "
             f"{outputs.std_px:.2f} px that weighed them; the sigmas of the results allow for it."
         )
-    if outputs.flights is not None:
-        made += flight_lines(outputs.flights)
+    made += [f"Flight {line}." for line in flight_lines(flight_facts(outputs.flights))]
     return [*made, *grouped(told.left_out)]
 
 

@@ -132,7 +132,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
             *geo.height_notes(measured, judged, frame),
             *judged.notes,
             *attitude_notes,
-            *_flight_notes(flight, params),
+            *_flight_notes(flight, params, has_time=measured.has_time),
         ),
         flight=flight,
         flight_std_m=params.flight_offset,
@@ -140,12 +140,13 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     return Outputs(reference=reference, target_crs=params.target_crs)
 
 
-def _flight_notes(flight: np.ndarray | None, params: Params) -> list[str]:
+def _flight_notes(flight: np.ndarray | None, params: Params, *, has_time: bool) -> list[str]:
     if flight is None:
         return []
     counts = np.bincount(flight)
     if len(counts) < 2:
-        return [f"crs.flight_offset={params.flight_offset:g} has no effect: all photos are of one flight."]
+        timeless = "" if has_time else ", since not every photo has a time"
+        return [f"crs.flight_offset={params.flight_offset:g} has no effect: all photos count as one flight{timeless}."]
     photos = ", ".join(map(str, counts))
     return [
         f"{len(counts)} flights, told by pauses and cameras, of {photos} photos: the positions of each have an offset "

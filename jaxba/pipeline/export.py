@@ -243,6 +243,8 @@ def _write_tile(inputs: Inputs) -> list[str]:
         control=control_part(block, control, adjusted.mark_used, adjusted.control.used_std_m),
         common=adjusted.common,
     )
+    if adjusted.flights is not None:
+        problem = dataclasses.replace(problem, position_offset=np.nan_to_num(adjusted.flights.offset_m))
     problem = weighed(problem, adjusted.spread, block.num_observations)
     known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
     left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]

@@ -1,5 +1,6 @@
 """What is said of the place on earth: the CRS, what heights are above, positions on review, offsets of flights."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,20 +30,21 @@ def flight_facts(flights: FlightOffsets | None) -> list[dict[str, Any]]:
         {
             "flight": int(number) + 1,
             "photos": int(count),
-            "offset_m": list(map(float, offset)),
+            "offset_m": [float(value) if np.isfinite(value) else None for value in offset],
             "std_m": [float(value) if np.isfinite(value) else None for value in std],
         }
         for number, count, offset, std in zip(*columns, strict=True)
     ]
 
 
-def flight_lines(flights: FlightOffsets) -> list[str]:
-    """Return the same in words."""
+def flight_lines(facts: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return facts of flights in words."""
     lines = []
-    for fact in flight_facts(flights):
-        values = ", ".join(
-            f"{value:+.3f}" + ("" if std is None else f" ({std:.3f})")
-            for value, std in zip(fact["offset_m"], fact["std_m"], strict=True)
-        )
-        lines.append(f"Flight {fact['flight']}, {fact['photos']} photos: positions off by {values} m east, north, up.")
+    for fact in facts:
+        axes = [
+            of for of in zip(("east", "north", "up"), fact["offset_m"], fact["std_m"], strict=True) if of[1] is not None
+        ]
+        values = ", ".join(f"{value:+.3f}" + ("" if std is None else f" ({std:.3f})") for _, value, std in axes)
+        names = ", ".join(axis for axis, _, _ in axes)
+        lines.append(f"{fact['flight']}, {fact['photos']} photos: positions off by {values} m {names}")
     return lines

@@ -73,7 +73,8 @@ class CommonOffset:
 class FlightOffsets:
     """What the positions of each flight have in common, measured minus true, world, metres; one row a flight.
 
-    - `number`: as in `Reference.flight`. `num_photos`: with a position that is used. `std_m`: sigma, NaN where unknown.
+    - `number`: as in `Reference.flight`. `num_photos`: with a position that is used.
+    - `offset_m`, `std_m`: NaN along an axis that is not measured; `std_m` also without sigmas.
     """
 
     number: Int[np.ndarray, " flights"]

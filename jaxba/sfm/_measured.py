@@ -36,13 +36,13 @@ def flights_of(
 ) -> tuple[Int[np.ndarray, " flights"], Int[np.ndarray, " positions"]] | None:
     """Return the numbers of the flights of positions that are priors, and which of these each position has.
 
-    None where flights are not told apart, or there is but one.
+    None where flights are not told apart, where there is but one, and of too few positions.
     """
     if reference.flight is None:
         return None
     found = reference.flight[block.image_index[used_positions(block, reference)]]
     numbers, index = np.unique(found, return_inverse=True)
-    return None if len(numbers) < 2 else (numbers, index)
+    return None if len(numbers) < 2 or len(found) < LEAST_POSITIONS else (numbers, index)
 
 
 def common_std(block: Block, reference: Reference) -> Float[np.ndarray, "3"] | None:

@@ -31,7 +31,7 @@ from jaxba.sfm._control import CONTROL_LOSS, Standing, after_tests
 from jaxba.sfm._control_explained import Explained, explain
 from jaxba.sfm._control_start import transformed
 from jaxba.sfm._control_statistics import Tested, control_statistics
-from jaxba.sfm._measured import common_std
+from jaxba.sfm._measured import common_std, flights_of, median_offset
 from jaxba.sfm._misclosure import Misclosure
 from jaxba.sfm._rounds import Solved
 from jaxba.sfm._spread import spread, weighed
@@ -39,6 +39,7 @@ from jaxba.sfm._spread import spread, weighed
 _log = logging.getLogger(__name__)
 
 _MOST = 5  # solves on control
+_ALREADY_FREE_M = 1e-4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,11 +72,15 @@ def onto_control(
     if solved.control is None:
         return solved, None
     common_std_m = common_std(solved.block, reference)
+    moves_m = np.zeros(3) if common_std_m is None else common_std_m
+    if flights_of(solved.block, reference) is not None:
+        # offsets of flights are free in the block already; a shift of all of them beside is a mistake to be looked for
+        moves_m = np.where(np.isfinite(median_offset(solved.block, reference)), _ALREADY_FREE_M, 0.0)
     none = Explained(control.num_points)
     found, standing, why_not = none, None, None
     for count in range(_MOST + 1):
         try:
-            given = _misclosure(solved, std_px, control, standing, common_std_m, max_memory)
+            given = _misclosure(solved, std_px, control, standing, moves_m, max_memory)
             why_not = None
         except JaxbaError as error:
             given, why_not = None, str(error)
@@ -99,16 +104,15 @@ def _misclosure(
     std_px: float,
     control: Control,
     standing: Standing | None,
-    common_std_m: Float[np.ndarray, "3"] | None,
+    moves_m: Float[np.ndarray, "3"],
     max_memory: float | str | None,
 ) -> Misclosure:
     """Return what photos and positions say of the control points, linearised at a solution.
 
-    - `standing`: of that solution; None where control did not hold it.
+    - `standing`: of that solution; None where control did not hold it. `moves_m`: see `Misclosure.common_std_m`.
     """
     part = solved.control
     assert part is not None
-    moves = np.zeros(3) if common_std_m is None else common_std_m
     block, rows = solved.block, part.rows
     shown = spread(block, solved.error_px, std_px, solved.loss)
 
@@ -131,13 +135,13 @@ def _misclosure(
             left = np.asarray(CONTROL_LOSS.derivatives(jnp.asarray(np.sum(over**2, axis=1)))[1])
         pulls = left[:, None] * over / held
         off[rows] += np.einsum("iajb,jb->ia", of_points(yielding=True), pulls) + np.where(
-            moves > 0, solved.common_m, 0.0
+            moves_m > 0, solved.common_m, 0.0
         )
     else:
         covariance = covariance + _bent(covariance, part.start_m)
     whole = np.zeros((control.num_points, 3, control.num_points, 3))
     whole[rows[:, None], :, rows] = covariance.transpose(0, 2, 1, 3)
-    return Misclosure(off, control.xyz_m, control.std_m, whole, moves)
+    return Misclosure(off, control.xyz_m, control.std_m, whole, moves_m)
 
 
 def without_control(problem: Problem) -> Problem:

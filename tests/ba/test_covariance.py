@@ -213,6 +213,16 @@ def test_inner_constraints_are_refused_where_something_is_fixed():
         covariance(small_block().fix(poses=[3]), datum="inner")
 
 
+def test_inner_constraints_are_refused_for_too_few_points():
+    problem = uav_block(6, seed=6, points_per_image=16.0).problem
+    seen = problem.observations
+    often = np.argsort(-np.bincount(seen.point_index), kind="stable")[:8]
+    kept = np.isin(seen.point_index, often)
+    few = dataclasses.replace(problem, observations=jax.tree.map(lambda a: a[kept], seen))
+    with pytest.raises(JaxbaError, match=r'datum "inner" needs 10 points or more'):
+        covariance(few.fix(intrinsics=True), datum="inner")
+
+
 def with_a_fixed_point() -> Problem:
     """As a block is in which a point seen once is held, so that both share one program."""
     return small_block().fix(points=[20])

@@ -281,7 +281,8 @@ def test_refusal_says_what_is_free_and_what_to_do():
         require_gauge(block(), "Covariance")
     assert str(error.value) == (
         f"Covariance: problem has no gauge, 7 directions are free ({', '.join(ALL)}). "
-        "Add a position prior with finite std_m or three control points, or fix two poses."
+        "Add a position prior with finite std_m or three control points, or fix two poses. "
+        'Or take those of the photos alone: datum="inner".'
     )
     problem = block()
     with pytest.raises(JaxbaError, match=r"1 direction is free \(rotation about x\). Positions along one line"):

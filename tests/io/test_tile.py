@@ -230,6 +230,7 @@ POSITION = {
              f"prior_position_loss_alpha: loss Barron: alpha is {text}; give 2")
             for alpha, text in ((2.5, "2.5"), (np.nan, "nan"), (np.inf, "inf"))
         ),
+        ({"observation_loss_f_scale": 2.0}, "observation_loss_f_scale is given, but no observation_loss; name"),
         ({"observation_loss": "l1"}, "observation_loss is 'l1'; use one of linear, soft_l1"),
         ({"observation_loss": "huber", "observation_loss_alpha": 1.0},
          "observation_loss_alpha is given, but huber has f_scale only"),

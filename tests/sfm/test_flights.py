@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxba import sfm
-from jaxba.scene import Reference
+from jaxba.report import flight_facts, flight_lines
+from jaxba.scene import FlightOffsets, Reference
 from jaxba.simulation.staged import Simulated, measured_anew, simulate, spread_control
 
 OFF_M = np.array([0.4, -0.3, 0.5])
@@ -66,9 +67,48 @@ def test_control_tells_what_both_flights_are_off(survey: Simulated) -> None:
     assert np.all(flights.std_m < 0.08)
     np.testing.assert_array_less(np.abs(flights.offset_m - truth) / flights.std_m, 4.0)
     assert squared_error(survey, found, sigmas) < 3.0
+    # what both flights are off from control beside that is told, with their offsets taken into account
+    away = dataclasses.replace(reference, xyz_m=reference.xyz_m + np.array([0.0, 0.0, 30.0]))
+    found, sigmas = adjusted(survey, away, control=control)
+    assert found.on_control is not None and found.on_control.explained.is_shifted.tolist() == [False, False, True]
+    assert not found.on_control.explained.wrong.any()
+    off_m = found.block.centers_m - np.asarray(survey.survey.truth.poses.center)
+    assert np.abs(off_m).max() < 0.2
 
 
 def test_one_flight_has_no_offset_of_its_own(survey: Simulated) -> None:
     reference = dataclasses.replace(survey.reference, flight=np.zeros(20, int), flight_std_m=1.0)
     problem = sfm.to_problem(survey.block, reference, survey.photos)
     assert len(problem.position_offset) == 0
+
+
+def test_offsets_are_told_with_their_sigmas() -> None:
+    flights = FlightOffsets(
+        np.array([0, 2]), np.array([3, 4]), np.array([[0.1, -0.2, 0.3], [0.0, 0.0, 1.0]]), np.full((2, 3), np.nan)
+    )
+    flights.std_m[0] = 0.05
+    facts = flight_facts(flights)
+    assert facts[0] == {"flight": 1, "photos": 3, "offset_m": [0.1, -0.2, 0.3], "std_m": [0.05] * 3}
+    assert facts[1]["std_m"] == [None] * 3 and flight_facts(None) == []
+    assert flight_lines(facts) == [
+        "1, 3 photos: positions off by +0.100 (0.050), -0.200 (0.050), +0.300 (0.050) m east, north, up",
+        "3, 4 photos: positions off by +0.000, +0.000, +1.000 m east, north, up",
+    ]
+
+
+def test_too_few_positions_have_no_offsets_of_flights(survey: Simulated) -> None:
+    # breaks where photos that are held at their start get offsets that no position of theirs has
+    used = np.isin(np.arange(20), [0, 15])
+    reference = dataclasses.replace(told_apart(survey.reference), is_used=used)
+    problem = sfm.to_problem(survey.block, reference, survey.photos)
+    assert len(problem.position_offset) == 0
+
+
+def test_an_axis_that_is_not_measured_has_no_offset(survey: Simulated) -> None:
+    found, sigmas = adjusted(survey, told_apart(survey.reference))
+    std_m = survey.reference.std_m.copy()
+    std_m[:, 2] = np.inf
+    flat = dataclasses.replace(told_apart(survey.reference), std_m=std_m)
+    flights = sfm.flight_offsets(found, sigmas, flat)
+    assert flights is not None and np.isnan(flights.offset_m[:, 2]).all() and np.isfinite(flights.offset_m[:, :2]).all()
+    assert np.isfinite(sfm.without_offsets(flat, flights).xyz_m).all()

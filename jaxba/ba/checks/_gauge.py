@@ -84,6 +84,8 @@ def require_gauge(problem: Problem, purpose: str) -> None:
         if any(unknown in name for name in free):
             cures = [f"Hold the {unknown} fixed or add a {unknown} prior with finite std_m.", *cures]
             cures = cures[: 1 if all(unknown in name for name in free) else 2]
+    if purpose in ("Covariance", "Statistics"):
+        cures.append('Or take those of the photos alone: datum="inner".')
     raise JaxbaError(f"{purpose}: problem has no gauge, {count} free ({', '.join(free)}). {' '.join(cures)}")
 
 

@@ -243,6 +243,9 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
                 f"prior {prior.name}: {label(int(twice[0]))} has more than one row{_more(twice)}; keep one of them."
             )
         label = lambda row: of_kind(int(index[row]))  # noqa: E731
+    if prior.name == "position_offset" and not indices:
+        every = np.arange(sizes["rows"])
+        _check_index(problem, f"prior {prior.name}: rows", every, "rows", "offsets", sizes)
     for name in indices[1:]:
         _check_index(problem, f"prior {prior.name}: {name}", values[name], "rows", f"{name[:-6]}s", sizes)
     for field in fields:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
-from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba._problem import Problem
 from jaxba.ba._system import System, own_unknowns, restore
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.tiles._cut import Tile
@@ -88,11 +88,6 @@ class GradientSums:
             ),
         )  # fmt: skip
         return changed, _like_loss(self._loss, self._losses[0])
-
-
-def _zeros_of_numbers(prior: AbstractPrior) -> dict[str, np.ndarray]:
-    fields = {name: np.asarray(value) for name, value in vars(prior).items() if name != "loss"}
-    return {name: np.zeros(value.shape) for name, value in fields.items() if value.dtype.kind == "f"}
 
 
 def _like_prior(prior: Any, fields: dict[str, np.ndarray], loss: np.ndarray) -> Any:

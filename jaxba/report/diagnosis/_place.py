@@ -253,10 +253,10 @@ def _is_sound(case: Recorded) -> bool:
 
 def _against_photos(case: Recorded, figures: dict[str, object]) -> list[str]:
     """Return what the adjusted block says against the positions."""
-    from jaxba.sfm import gnss_fit  # loads jax
+    from jaxba.sfm import gnss_fit, without_offsets  # loads jax
 
     done, texts = case.done, []
-    block, reference = done.adjust.block, done.control.reference
+    block, reference = done.adjust.block, without_offsets(done.control.reference, done.adjust.flights)
     fit = gnss_fit(block, reference)
     bad: Bool[np.ndarray, " images"] = fit.is_outlier
     most = float(np.nanmax(np.abs(fit.residual_m[bad] - fit.middle_m))) if bad.any() else 0.0

@@ -35,12 +35,14 @@ class PositionPrior(AbstractPrior):
     loss: AbstractLoss = Linear()
     offset_weights: Float[Array | np.ndarray, "rows offsets"] | None = None
 
-    def _weights(self, count: int) -> Float[Array | np.ndarray, "rows offsets"]:
-        return np.ones((len(self.image_index), count)) if self.offset_weights is None else self.offset_weights
-
     def offset(self, offsets: Float[Array | np.ndarray, "offsets 3"]) -> Float[Array | np.ndarray, "rows 3"]:
         """Return the offset of each row, metres, world; zero where a problem has none."""
-        return self._weights(len(offsets)) @ offsets
+        return self._weights(offsets) @ offsets
+
+    def _weights(self, offsets: Float[Array | np.ndarray, "offsets 3"]) -> Float[Array | np.ndarray, "rows offsets"]:
+        if self.offset_weights is None:
+            return np.ones((len(self.image_index), len(offsets)), offsets.dtype)
+        return self.offset_weights
 
     def residual(self, unknowns: Unknowns) -> Float[Array, "3 rows"]:
         rotation = rotation_rows(unknowns.poses.rotation, jnp.asarray(self.image_index))
@@ -54,7 +56,7 @@ class PositionPrior(AbstractPrior):
         transposed = jnp.swapaxes(rotation, 0, 1) / jnp.asarray(self.std_m).T[:, None]
         x, y, z = unknowns.lever_arm
         by_offset = jnp.eye(3, dtype=transposed.dtype)[:, :, None] / jnp.asarray(self.std_m).T[:, None]
-        weights = jnp.asarray(self._weights(len(unknowns.position_offset)))
+        weights = jnp.asarray(self._weights(unknowns.position_offset))
         # R^T [l]_x, column by column
         turn = [
             transposed[:, 1] * z - transposed[:, 2] * y,

@@ -21,9 +21,12 @@ SITE_COLUMNS = {
     "std_e_m": "sigma of the adjusted place along true east, metres; empty where it is not known",
     "std_n_m": "sigma along true north, metres; empty where it is not known",
     "std_u_m": "sigma up, metres; empty where it is not known",
-    "gnss_residual_e_m": "adjusted minus measured place along true east, metres; empty where none was used",
-    "gnss_residual_n_m": "adjusted minus measured place along true north, metres; empty where none was used",
-    "gnss_residual_u_m": "adjusted minus measured place up, metres; empty where none was used",
+    "gnss_residual_e_m": "adjusted minus measured place along true east, less its flight's offset, metres; "
+    "empty where none was used",
+    "gnss_residual_n_m": "adjusted minus measured place along true north, less its flight's offset, metres; "
+    "empty where none was used",
+    "gnss_residual_u_m": "adjusted minus measured place up, less its flight's offset, metres; "
+    "empty where none was used",
     "yaw_deg": "yaw of the camera, degrees clockwise from true north, as drones write it; undetermined straight down",
     "pitch_deg": "pitch of the camera, degrees: 0 level, -90 straight down",
     "roll_deg": "roll of the camera, degrees: positive with the right side down; undetermined straight down",

@@ -28,9 +28,7 @@ TURNS = {
 _FITS = 0.15  # of the longer side, median, twice outside: positions of metres and tilts of degrees see points so near
 _CLEARLY = 0.5  # of the distance on the stored grid
 _LEAST_MARKS = 3
-_OTHER_SIZE = (
-    1.3  # of the photos that marks were set in, over the photos'; nearer ones may be errors of what is expected
-)
+_OTHER_SIZE = 1.3  # at least, of photos that marks were set in over the photos: nearer, what is expected may err
 _NEARLY = 1.2  # the photos' own orientation counts before others that fit about as well
 
 

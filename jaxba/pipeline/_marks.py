@@ -118,9 +118,7 @@ def marks_in_photos(
         name=name,
     )
     own, notes = given.orientation, []
-    seen_px = None
-    if orientation == "auto" and expected is not None:
-        seen_px = expected(np.array(point), np.array(image))
+    seen_px = None if expected is None else expected(np.array(point), np.array(image))
     if orientation == "auto":
         notes = _refuse_turned(given, seen_px)
     turn = own if orientation == "exif" else np.full(len(own), int(orientation) if orientation.isdigit() else 1)

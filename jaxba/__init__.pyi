@@ -23,6 +23,7 @@ from .ba import (
     Rejected as Rejected,
     Report as Report,
     RowStatistics as RowStatistics,
+    ScaleBarPrior as ScaleBarPrior,
     SchurDogleg as SchurDogleg,
     SchurLevenbergMarquardt as SchurLevenbergMarquardt,
     Solution as Solution,
@@ -46,6 +47,7 @@ from .ba import (
     solve_tiled as solve_tiled,
     statistics as statistics,
     tune as tune,
+    with_scale_bars as with_scale_bars,
 )
 from .geometry import (
     BAL as BAL,

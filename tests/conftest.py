@@ -36,6 +36,8 @@ use_compilation_cache()
 for library in ("numpy.linalg", "scipy.linalg"):
     importlib.import_module(library)
 threadpool_limits(1, user_api="blas")
+# tracing makes objects by the million and next to no cycles: a collection every 700 of them took an eighth of the time
+gc.set_threshold(100_000, 20, 50)
 # the same examples each time, however long one takes on a machine that is busy
 hypothesis.settings.register_profile("tests", derandomize=True, database=None, deadline=None)
 hypothesis.settings.load_profile("tests")

@@ -42,13 +42,22 @@ class Survey:
         geotags: Path | None = None,
         gcp: Path | None = None,
         check: Path | None = None,
+        bars: Path | None = None,
         workers: int = 1,
         tell: Callable[[Event], None] = lambda event: None,
     ) -> Run:
         """Run as far as told; one worker does, since the session's processes keep the cores busy among them."""
         settings = changed(PIPELINE.settings, [*FAST, f"workers.workers={workers}", *changes])
         return run_pipeline(
-            self.photos, self.project, settings, until=until, geotags=geotags, gcp=gcp, check=check, tell=tell
+            self.photos,
+            self.project,
+            settings,
+            until=until,
+            geotags=geotags,
+            gcp=gcp,
+            check=check,
+            bars=bars,
+            tell=tell,
         )
 
 

@@ -13,6 +13,7 @@ from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
 from jaxba.ba._reliability import NONCENTRALITY, RowStatistics
 from jaxba.ba._reweight import Reweighted, solve_and_reweight
 from jaxba.ba._rows import JacobianBlock, Rows
+from jaxba.ba._scale_bars import with_scale_bars
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt, residuals
@@ -30,6 +31,7 @@ from jaxba.ba.groups import (
     LeverArmPrior,
     PositionOffsetPrior,
     PositionPrior,
+    ScaleBarPrior,
 )
 from jaxba.ba.tiles._batch import solve_batch
 from jaxba.ba.tiles._merge import Merged, MergedTile, merge_tiles
@@ -71,6 +73,7 @@ __all__ = [
     "Reweighted",
     "RowStatistics",
     "Rows",
+    "ScaleBarPrior",
     "SchurDogleg",
     "SchurLevenbergMarquardt",
     "Solution",
@@ -101,4 +104,5 @@ __all__ = [
     "solve_tiled",
     "statistics",
     "tune",
+    "with_scale_bars",
 ]

@@ -194,9 +194,13 @@ def _in_order(
     shared_free = np.zeros(0, bool) if shape.own_cameras else free_intrinsics[:, refined].reshape(-1)
     border_free = np.append(shared_free, problem.free_antenna[: shape.antenna])
     border = found.border * np.outer(border_free, border_free)
-    antenna = np.zeros((3 + 3 * max(len(problem.position_offset), 1),) * 2)
-    antenna[: shape.antenna, : shape.antenna] = border[num_shared:, num_shared:]
-    named = [*range(num_shared), *(num_shared + np.flatnonzero(problem.free_antenna[: shape.antenna]))]
+    offsets, num_antenna = len(problem.position_offset) - problem.num_bar_ends, 0
+    if shape.antenna:
+        num_antenna = 3 + 3 * offsets
+    antenna = np.zeros((3 + 3 * max(offsets, 1),) * 2)
+    of_antenna = slice(num_shared, num_shared + num_antenna)
+    antenna[:num_antenna, :num_antenna] = border[of_antenna, of_antenna]
+    named = [*range(num_shared), *(num_shared + np.flatnonzero(problem.free_antenna[:num_antenna]))]
     intrinsics = np.zeros((num_cameras, len(names), len(names)))
     if shape.own_cameras:
         intrinsics[np.ix_(np.asarray(problem.camera_index), refined, refined)] = blocks[:, 6:, 6:]

@@ -106,7 +106,11 @@ def _of_prior(
     of_images: Float[Array, "images columns columns"],
     of_points: Float[Array, "points 3 3"],
 ) -> Leverage:
-    """Return those of a prior, whose rows touch one kind of unknowns, or a pose and the antenna."""
+    """Return those of a prior, whose rows touch one kind of unknowns, or a pose and the antenna.
+
+    Of rows that touch a point and the antenna, as scale bars do, none of the components that depend on the point: these
+    tie the one to the other, and measure nothing.
+    """
     plain = dataclasses.replace(prior, loss=Linear())
     rows = robust_rows(system, plain, unknowns, jnp.zeros(()))
     residual = jnp.asarray(rows.residual).T
@@ -115,7 +119,10 @@ def _of_prior(
     leverage = jnp.zeros((count, components, components), residual.dtype)
     border = inverse.corner.shape[0]
     antenna = slice(border - system.shape.antenna, border)
-    if rows.point is not None:
+    measures = jnp.ones((count, components), bool)
+    if rows.point is not None and rows.antenna is not None:
+        measures = jnp.all(rows.point.jacobian == 0, axis=1).T
+    elif rows.point is not None:
         reach = jnp.einsum("nij,cjn->nic", rows_of(of_points, rows.point.index), rows.point.jacobian)
         leverage += jnp.einsum("cin,nid->ncd", rows.point.jacobian, reach)
     if rows.intrinsics is not None:
@@ -133,6 +140,7 @@ def _of_prior(
     if rows.antenna is not None and system.shape.antenna:
         of_antenna = jnp.asarray(inverse.corner)[antenna, antenna]
         leverage += jnp.einsum("cin,ij,djn->ncd", rows.antenna, of_antenna, rows.antenna)
+        leverage *= measures[:, :, None] & measures[:, None]
     return Leverage(residual, leverage, reach)
 
 

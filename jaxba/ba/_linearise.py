@@ -43,8 +43,8 @@ class Linearisation(eqx.Module):
     - `image_products`: of the columns pose (6), refined intrinsics (k), residual (1).
     - `w`: W of each row.
     - `point_products`: the points' 3x3 blocks.
-    - `point_shared`: each point's block with the shared intrinsics, all cameras side by side; none if they are own
-      ones.
+    - `point_shared`: each point's block with the shared intrinsics, all cameras side by side, none if they are own
+      ones; then with the antenna where a prior couples these.
     - `prior_blocks`: of the priors; the points' blocks hold theirs already.
     - `gradient`, `diagonal`: J^T r and the diagonal of J^T J, of all groups.
     """
@@ -179,6 +179,9 @@ def assemble(
     (of_points, of_shared), (run_products, w) = scan_chunks(system, body, start)
     image_products = sum_runs(system, run_products)
     of_shared = jnp.swapaxes(of_shared.reshape(shape.num_points, cameras, 3, k), 1, 2)
+    of_border = of_shared.reshape(shape.num_points, 3, cameras * k)
+    if shape.antenna:
+        of_border = jnp.concatenate([of_border, blocks.points_antenna], axis=2)
     point_products = of_points[:, :, 1:] + blocks.points
 
     def diagonal_of(matrix: Array) -> Array:
@@ -202,7 +205,7 @@ def assemble(
         image_products,
         w,
         point_products,
-        of_shared.reshape(shape.num_points, 3, cameras * k),
+        of_border,
         blocks,
         gradient,
         diagonal,
@@ -218,7 +221,9 @@ def curvature(system: System, model: Linearisation, step: Step) -> Float[Array, 
     total += jnp.einsum("pi,pij,pj->", step.points, model.point_products, step.points)
     of_points = segments(w_product(system, model.w, of_images), system.reprojection.point_index, step.points.shape[0])
     if model.point_shared.shape[-1]:
-        of_points += model.point_shared @ refined.reshape(-1)
+        shared = refined.reshape(-1)[: system.shape.border - system.shape.antenna]
+        on_border = jnp.concatenate([shared, step.antenna])
+        of_points += model.point_shared @ on_border[: model.point_shared.shape[-1]]
     total += 2 * jnp.vdot(step.points, of_points)
     blocks = model.prior_blocks  # the points' blocks hold the priors on points already
     total += jnp.einsum("ma,mab,mb->", step.poses, blocks.poses, step.poses)

@@ -79,7 +79,7 @@ def joint_marginals(system: System, model: Linearisation, inverse: InverseBlocks
     z = apply_root(rows_of(eliminated.root, point), eliminated.w)
     z_shared = apply_root(eliminated.root, eliminated.shared)
     num_shared = z_shared.shape[-1]
-    from_border = jnp.swapaxes(inverse.border[:, :, :num_shared], 1, 2)  # no point sees a lever arm
+    from_border = jnp.swapaxes(inverse.border[:, :, :num_shared], 1, 2)
 
     def add_pairs(through: Array, pairs: tuple[Array, Array, Array]) -> tuple[Array, None]:
         first, second, block = pairs

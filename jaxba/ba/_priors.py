@@ -1,7 +1,8 @@
 """Rows of priors: made robust, masked by what is free, multiplied and summed.
 
 What the normal equations need of all priors together is one block an image, a camera and a point, that of the
-antenna (lever arm and common offset), and the antenna's with each image: `PriorBlocks`. No prior couples anything else.
+antenna (lever arm and offsets), and the antenna's with each image and each point: `PriorBlocks`. No prior couples
+anything else.
 """
 
 import equinox as eqx
@@ -42,13 +43,17 @@ def robust_rows(system: System, prior: AbstractPrior, unknowns: Unknowns, bend: 
 
 
 class PriorBlocks(eqx.Module):
-    """Blocks of J^T J, or of second derivatives, summed over all priors; intrinsics with all their columns."""
+    """Blocks of J^T J, or of second derivatives, summed over all priors; intrinsics with all their columns.
+
+    `points_antenna` has no columns where no prior couples points to the antenna.
+    """
 
     poses: Float[Array, "images 6 6"]
     intrinsics: Float[Array, "cameras parameters parameters"]
     antenna: Float[Array, "antenna antenna"]
     poses_antenna: Float[Array, "images 6 antenna"]
     points: Float[Array, "points 3 3"]
+    points_antenna: Float[Array, "points 3 coupled"]
 
     @staticmethod
     def zeros(like: Step) -> "PriorBlocks":
@@ -63,6 +68,7 @@ class PriorBlocks(eqx.Module):
             antenna=zeros(like.antenna, like.antenna.shape[0]),
             poses_antenna=zeros(like.poses, like.antenna.shape[0]),
             points=zeros(like.points, 3),
+            points_antenna=zeros(like.points, 0),
         )
 
 
@@ -135,18 +141,23 @@ def _add(blocks: PriorBlocks, rows: Rows, matrix: Float[Array, "rows columns col
         of_kind = matrix[:, places[kind], places[kind]]
         return total + segments(of_kind, getattr(rows, kind).index, total.shape[0])
 
-    antenna, cross = blocks.antenna, blocks.poses_antenna
+    antenna, cross, of_points = blocks.antenna, blocks.poses_antenna, blocks.points_antenna
     if "antenna" in places:
         antenna += jnp.sum(matrix[:, places["antenna"], places["antenna"]], axis=0)
         if rows.pose is not None:
             across = matrix[:, places["pose"], places["antenna"]]
             cross += segments(across, rows.pose.index, cross.shape[0])
+        if rows.point is not None:
+            across = matrix[:, places["point"], places["antenna"]]
+            summed = segments(across, rows.point.index, of_points.shape[0])
+            of_points = of_points + summed if of_points.shape[-1] else summed
     return PriorBlocks(
         square(blocks.poses, "pose"),
         square(blocks.intrinsics, "intrinsics"),
         antenna,
         cross,
         square(blocks.points, "point"),
+        of_points,
     )
 
 

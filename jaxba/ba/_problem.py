@@ -87,6 +87,7 @@ class Problem(eqx.Module):
     - `image_names`: used in messages; empty, or one an image.
     - `position_offset`: what positions of the position prior have in common beside their errors, measured minus true,
       metres, world: a row for all of them, one a flight, a drift (`PositionPrior.offset_weights`); none without such.
+      The last rows are the ends of scale bars, where there are any (`with_scale_bars`).
 
     `Problem.build` fills in the defaults; `fix` and `bound` return changed copies.
     """
@@ -126,6 +127,12 @@ class Problem(eqx.Module):
         parts = self.lever_arm, self.position_offset
         xp = _namespace(parts)
         return xp.concatenate([xp.asarray(part).reshape(-1) for part in parts])
+
+    @property
+    def num_bar_ends(self) -> int:
+        """How many rows of `position_offset`, the last ones, are the ends of scale bars."""
+        bars = self.prior("scale_bar")
+        return 0 if bars is None else np.shape(vars(bars)["offset_index"])[0]
 
     @property
     def free_antenna(self) -> Any:

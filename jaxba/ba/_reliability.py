@@ -42,7 +42,7 @@ class RowStatistics:
       check. `p_value`: of it.
     - `detectable`: the smallest error that a test of 0.1% finds in four of five cases (internal reliability).
     - `reach_m`: metres by which an error of that size moves the point, or the camera of a prior on images (external
-      reliability); 0 for what is neither.
+      reliability); 0 for what is neither, NaN where it is not known.
     """
 
     name: str
@@ -82,7 +82,7 @@ def row_statistics(
     test = np.where(checked, error / np.sqrt(variance), np.nan)
     detectable = np.where(used, np.where(checked, NONCENTRALITY * np.sqrt(variance), np.inf), np.nan)
     moved = np.linalg.norm(reach, axis=1) * weight[:, None]
-    reach_m = np.where(moved > 0, detectable * moved, np.where(used, 0.0, np.nan))
+    reach_m = np.where(moved > 0, detectable * moved, np.where(used & (moved == 0), 0.0, np.nan))
 
     # along the eigenvectors of the leverage components are independent; two rays of a point check one direction alone
     spread, turn = np.linalg.eigh(np.where(used[:, :, None] & used[:, None], leverage, 0.0))

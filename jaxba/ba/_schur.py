@@ -88,18 +88,18 @@ def eliminate_points(system: System, model: Linearisation, damping: Step) -> Red
     vector = to_reduced(system, damping)
     diagonal = before[:, : shape.block, : shape.block] - eliminated[:, :, : shape.block]
     diagonal += _diagonal_matrix(vector.images)
-    num_shared = z_shared.shape[-1]
+    num_shared = shape.border - shape.antenna  # what follows them in `z_shared` is the antenna
     border = -eliminated[:, :, shape.block :]
-    flat = z_shared.reshape(3 * shape.num_points, num_shared)
+    flat = z_shared.reshape(3 * shape.num_points, z_shared.shape[-1])
     corner = -(flat.T @ flat)
     if num_shared:
         k, images = shape.num_refined, jnp.arange(shape.num_images)
         camera = system.reprojection.camera_index
-        by_camera = border.reshape(shape.num_images, 6, shape.num_cameras, k)
+        by_camera = border[:, :, :num_shared].reshape(shape.num_images, 6, shape.num_cameras, k)
         by_camera = by_camera.at[images, :, camera, :].add(before[:, :6, 6:])
-        border = by_camera.reshape(shape.num_images, 6, num_shared)
+        border = border.at[:, :, :num_shared].set(by_camera.reshape(shape.num_images, 6, num_shared))
         corner = _add_cameras(corner, sum_cameras(system, before[:, 6:, 6:]))
-    antenna = shape.border - num_shared
+    antenna = shape.border - z_shared.shape[-1]
     border = jnp.pad(border, ((0, 0), (0, 0), (0, antenna)))
     corner = jnp.pad(corner, ((0, antenna), (0, antenna))) + _diagonal_matrix(vector.border)
     diagonal, border, corner = _add_priors(system, model.prior_blocks, diagonal, border, corner)

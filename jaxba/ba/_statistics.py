@@ -32,6 +32,7 @@ from jaxba.ba._tables import (
     prior_table,
 )
 from jaxba.ba._variance_components import VarianceComponent, components_by, reweighted, variance_components
+from jaxba.ba.groups import ScaleBarPrior
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS
 from jaxba.geometry import AbstractLoss, Linear, require_number
 
@@ -197,10 +198,21 @@ def prior_statistics(
 
 
 def _of_priors(problem: Problem, leverages: Sequence[Leverage]) -> tuple[RowStatistics, ...]:
-    return tuple(
-        row_statistics(prior.name, _sigmas(prior, np.asarray(rows.residual).shape), _weight(prior.loss, rows), rows)
-        for prior, rows in zip(problem.priors, leverages, strict=True)
-    )
+    def of_prior(prior: AbstractPrior, rows: Leverage) -> RowStatistics:
+        std = _sigmas(prior, np.asarray(rows.residual).shape)
+        if isinstance(prior, ScaleBarPrior):
+            std, rows = std[::2, :1], _of_bars(rows)
+        return row_statistics(prior.name, std, _weight(prior.loss, rows), rows)
+
+    return tuple(map(of_prior, problem.priors, leverages))
+
+
+def _of_bars(rows: Leverage) -> Leverage:
+    """Return those of whole bars, one row each: the row of a length between ends has half of a bar's variance, and half
+    of its misclosure and redundancy (`groups/_scale_bar.py`). Reach is not known.
+    """
+    residual, leverage = np.asarray(rows.residual)[::2, 3:], np.asarray(rows.leverage)[::2, 3:, 3:]
+    return Leverage(np.sqrt(2) * residual, 2 * leverage - 1, np.full((len(residual), 3, 1), np.nan))
 
 
 def _at(part: Float[np.ndarray, "kept *rest"], kept: Int[np.ndarray, " kept"], count: int) -> np.ndarray:

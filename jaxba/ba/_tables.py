@@ -3,8 +3,8 @@
     observations: image, point, x_px, y_px, std_px, residual_x_px, ..., redundancy_x, ..., test_x, ..., row_test,
                   p_value, detectable_x_px, ..., reach_x_m, ..., weight
 
-and so for every prior, whose first columns say what each row is about. What the other columns mean stands at the fields
-of `RowStatistics`.
+and so for every prior, whose first columns say what each row is about; of scale bars each row is one bar. What the
+other columns mean stands at the fields of `RowStatistics`.
 
     images, points: x_m, y_m, z_m of camera or point, std_x_m, ..., ellipse_a_m, ellipse_b_m, ellipse_azimuth_deg,
                     num_observations; images also camera and std_rot_x_rad, ... about the camera's axes
@@ -50,6 +50,11 @@ def observations_table(problem: Problem, rows: RowStatistics) -> DataFrame:
 def prior_table(problem: Problem, prior: AbstractPrior, rows: RowStatistics) -> DataFrame:
     """Return a row for each row of a prior."""
     about: dict[str, Any] = {}
+    if prior.name == "scale_bar":
+        bars = vars(prior)
+        one, other = np.asarray(bars["point_index"]).reshape(-1, 2).T
+        about = {"point_1": one, "point_2": other, "length_m": np.asarray(bars["length_m"])[::2]}
+        return _table(about, rows, ("",), "_m")
     for kind in ("image", "point", "camera"):
         index = getattr(prior, f"{kind}_index", None)
         if index is not None:

@@ -114,7 +114,8 @@ def reweighted(problem: Problem, components: Sequence[VarianceComponent], most: 
         field = next(f.name for f in dataclasses.fields(priors[number]) if f.name.startswith("std"))
         std = np.array(getattr(priors[number], field), float)
         by_axis = std if std.ndim == 2 else std[:, None]
-        by_axis[np.ix_(component.rows, component.axes)] *= times
+        of_rows = np.repeat(component.rows, len(by_axis) // len(component.rows))  # a scale bar has two
+        by_axis[np.ix_(of_rows, component.axes)] *= times
         priors[number] = dataclasses.replace(priors[number], **{field: std})
     observations = dataclasses.replace(problem.observations, std_px=std_px)
     return dataclasses.replace(problem, observations=observations, priors=tuple(priors))

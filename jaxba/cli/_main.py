@@ -175,6 +175,10 @@ def run(
         Parameter(help="Control points: a gcp_list.txt or CSV, or none. [default: gcp_list.txt among the photos]"),
     ] = None,
     check: Annotated[Path | None, Parameter(help="Check points, in the same form: only compared.")] = None,
+    bars: Annotated[
+        Path | None,
+        Parameter(help="Scale bars, distances of marked points: first, second, length_m, std_m."),
+    ] = None,
     require_connected: Annotated[
         bool, Parameter(negative="", show_default=False, help="Stop where the photos fall into several groups.")
     ] = False,
@@ -206,6 +210,7 @@ def run(
         geotags=geotags,
         gcp=gcp,
         check=check,
+        bars=bars,
         stage=stage,
         changes=set_,
         require_connected=require_connected,

@@ -17,7 +17,7 @@ from jaxba.cli._text import first_of, labelled, many, to_json, wrapped
 from jaxba.engine import changed
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.pipeline import Event, Run, run_pipeline
-from jaxba.report import accuracy_row, control_rows, flight_lines
+from jaxba.report import accuracy_row, bar_rows, control_rows, flight_lines
 
 _SUMMARY_LABEL = 12
 
@@ -32,6 +32,7 @@ def run(
     geotags: Path | None,
     gcp: Path | None,
     check: Path | None,
+    bars: Path | None,
     stage: str | None,
     changes: Sequence[str],
     require_connected: bool,
@@ -70,7 +71,9 @@ def run(
         settings = changed(settings, workers.changes())
         use_compilation_cache()
         with contextlib.nullcontext() if show is None else steps_told(show.step):
-            result = run_pipeline(photos, out, settings, until=stage, geotags=geotags, gcp=gcp, check=check, tell=tell)
+            result = run_pipeline(
+                photos, out, settings, until=stage, geotags=geotags, gcp=gcp, check=check, bars=bars, tell=tell
+            )
     except KeyboardInterrupt:
         said = "interrupted; what is done is kept, and the same command goes on from there."
         if json_lines is None:
@@ -106,7 +109,7 @@ def _print_summary(result: Run, out: Path) -> None:
     facts = result.facts
     rows: list[tuple[str, str]] = []
     if "adjust" in facts:
-        control = control_rows(facts.get("control"))
+        control = [*control_rows(facts.get("control")), *bar_rows(facts.get("bars"))]
         if "accuracy" in facts:
             control.append(("accuracy", accuracy_row(facts["accuracy"])))
         rows = _result_rows(facts["adjust"], control)

@@ -31,7 +31,7 @@ SETTINGS, SUMMARY, EXPORT = "jaxba.toml", "summary.json", "export"
 _RUN, _PHOTOS = "run.json", "photos.json"
 FOUND_LISTS = {"geotags": "geo.txt", "gcp": "gcp_list.txt"}
 """Names, in any case, of the lists that are used where they lie among the photos and no other is given."""
-_LISTS = ("geotags", "gcp", "check")
+_LISTS = ("geotags", "gcp", "check", "bars")
 _NO_LIST = Path("none")
 _LONGEST_NAME = 180  # bytes of a folder's name, which mostly may have 255
 
@@ -40,14 +40,15 @@ _LONGEST_NAME = 180  # bytes of a folder's name, which mostly may have 255
 class Given:
     """What a run was given beside its parameters: the folder of photos, and lists.
 
-    - `geotags`: replaces the photos' tags. `gcp`, `check`: surveyed points and their marks. `none` stands for no list,
-      not even one that lies among the photos.
+    - `geotags`: replaces the photos' tags. `gcp`, `check`: surveyed points and their marks. `bars`: known distances
+      between marked points. `none` stands for no list, not even one that lies among the photos.
     """
 
     photos: Path
     geotags: Path | None = None
     gcp: Path | None = None
     check: Path | None = None
+    bars: Path | None = None
 
 
 class Project:
@@ -132,7 +133,7 @@ class Project:
         content = self.read_json(_RUN)
         if not isinstance(content, dict) or "stage" not in content:
             raise JaxbaError(f"{self.folder / _RUN}: is damaged; run again.")
-        paths = {name: None if (text := content[name]) is None else Path(text) for name in _LISTS}
+        paths = {name: None if (text := content.get(name)) is None else Path(text) for name in _LISTS}
         return Given(photos=Path(content["photos"]), **paths), content["stage"]
 
     def write_json(self, name: str, content: object) -> None:
@@ -208,6 +209,7 @@ def read_lists(given: Given) -> dict[str, Any]:
         "geotags": _read_list(paths["geotags"], "a geo.txt or CSV"),
         "gcp": _read_list(paths["gcp"], "a gcp_list.txt or CSV"),
         "check": _read_list(paths["check"], "a gcp_list.txt or CSV"),
+        "bars": _read_list(paths["bars"], "a CSV of scale bars"),
         "found_lists": tuple(name for name, path in paths.items() if path is not None and getattr(given, name) is None),
         "own_lists": tuple(path.relative_to(folder).as_posix() for path in used if path.is_relative_to(folder)),
     }

@@ -3,12 +3,14 @@ from ._bal import (
     what_bal_cannot_hold as what_bal_cannot_hold,
     write_bal as write_bal,
 )
+from ._bars import BAR_COLUMNS as BAR_COLUMNS, MeasuredBar as MeasuredBar, parse_bars as parse_bars
 from ._cloud import Cloud as Cloud
 from ._colmap import (
     write_colmap_binary as write_colmap_binary,
     write_colmap_text as write_colmap_text,
 )
 from ._crs import CrsText as CrsText
+from ._csv_bars import BAR_RESULT_COLUMNS as BAR_RESULT_COLUMNS, write_csv_bars as write_csv_bars
 from ._csv_cloud import CLOUD_COLUMNS as CLOUD_COLUMNS, write_csv_cloud as write_csv_cloud
 from ._csv_control import (
     CONTROL_COLUMNS as CONTROL_COLUMNS,

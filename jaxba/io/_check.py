@@ -34,7 +34,7 @@ def check_arrays(
     if missing:
         listed = "; ".join(f"{spec.name} {shape_text(spec.shape)} {spec.kind}" for spec in missing)
         raise JaxbaError(f"{label}: arrays are missing, add them: {listed}.")
-    known: dict[str | int, int] = {**sizes}
+    known: dict[str | int, int] = {"ends": 2, **sizes}  # of a scale bar
     source: dict[str | int, str] = dict.fromkeys(sizes, "camera_model")
     checked = {}
     for spec in specs:

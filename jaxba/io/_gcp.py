@@ -16,12 +16,21 @@ as `# EPSG:32615` on the first line; latitude and longitude are EPSG:4326 withou
 
 import dataclasses
 import itertools
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
-from jaxba.io._list_cells import no_photos, number_or_nan, read_height, read_if_known, read_number, split_image
+from jaxba.io._list_cells import (
+    NOT_KNOWN,
+    no_photos,
+    number_or_nan,
+    read_height,
+    read_if_known,
+    read_number,
+    split_image,
+)
 from jaxba.io._list_text import (
     PLACE_COLUMNS,
     Line,
@@ -64,7 +73,8 @@ class Mark:
 class SurveyedPoint:
     """A point of a list, with all its marks.
 
-    - `crs`, `x`, `y`: east or longitude first. `z_m`: in the list's own unit and height system; None where it has none.
+    - `crs`, `x`, `y`: east or longitude first; empty and NaN of a point that is marked alone, without coordinates.
+    - `z_m`: in the list's own unit and height system; None where it has none.
     - `std_h_m`, `std_v_m`: None where the list states none. `is_check`: its role or name says so.
     - `source`: file and line. `is_named`: by the list; else it was given a number.
     """
@@ -80,6 +90,11 @@ class SurveyedPoint:
     is_check: bool = False
     source: str = ""
     is_named: bool = True
+
+    @property
+    def is_surveyed(self) -> bool:
+        """Whether it has coordinates."""
+        return self.x == self.x
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,12 +161,13 @@ def _read_list(content: list[Line], name: str, is_photo: Callable[[str], bool]) 
             cure = " Separate columns by blanks, or name them in a header line." if is_csv else ""
             count = "1 column" if len(cells) == 1 else f"{len(cells)} columns"
             raise JaxbaError(f"{where}: '{words}' has {count}; give x y z px py image, then a name.{cure}")
-        x, y, px, py = (read_number(cells[k], where, label) for k, label in ((0, "x"), (1, "y"), (3, "px"), (4, "py")))
+        px, py = (read_number(cells[k], where, label) for k, label in ((3, "px"), (4, "py")))
+        x, y = _read_place(cells[0], cells[1], where, ("x", "y"))
         image, rest = split_image(cells[5], is_photo)
         is_cell = rest.lstrip(" ").startswith("\t")  # else a blank ends the point's name
         given = rest.strip().split("\t")[0].strip() if is_cell else split_image(rest.strip(), no_photos)[0]
         mark = Mark(image=image, x_px=px, y_px=py, source=where)
-        rows.append(_row(given, where, crs, x, y, read_height(cells[2], where), mark))
+        rows.append(_row(given, where, crs if x == x else "", x, y, read_height(cells[2], where), mark))
     return rows
 
 
@@ -178,23 +194,33 @@ def _read_csv(table: Table, name: str) -> tuple[list[_Row], list[str]]:
             "(or longitude, latitude), z, px, py, image, name, and give a line for each photo that shows a point."
             f"{alone}"
         )
-    if not is_geographic and "crs" not in place and table.crs is None:
-        raise JaxbaError(f"{name}: x and y need a CRS; add a crs column, or a first line such as '# EPSG:32615'.")
     known: dict[str, str] = {}
     rows = []
     for line, cell in csv_rows(table, place, name):
         where = f"{name} line {line}"
+        x, y = _read_place(cell(x_name), cell(y_name), where, (x_name, y_name))
+        px, py = (read_number(cell(column), where, column) for column in ("px", "py"))
         text = cell("crs") or table.crs or ("EPSG:4326" if is_geographic else "")
-        if text not in known:
+        if x != x:
+            text = ""
+        elif not text and "crs" not in place:
+            raise JaxbaError(f"{name}: x and y need a CRS; add a crs column, or a first line such as '# EPSG:32615'.")
+        if x == x and text not in known:
             known[text] = read_crs(text, where, "gcp_list.txt")[0]
-        x, y, px, py = (read_number(cell(column), where, column) for column in (x_name, y_name, "px", "py"))
         if not cell("image"):
             raise JaxbaError(f"{where}: image '' is empty; write the photo's name, or delete the line.")
         mark = Mark(image=cell("image"), x_px=px, y_px=py, source=where)
         stds = [_sigma(cell, column, where) or _sigma(cell, "std", where) for column in ("std_h", "std_v")]
         z_m = read_height(cell("z"), where)
-        rows.append(_row(cell("name"), where, known[text], x, y, z_m, mark, *stds, role=_role(cell, where)))
+        rows.append(_row(cell("name"), where, known.get(text, ""), x, y, z_m, mark, *stds, role=_role(cell, where)))
     return rows, notes
+
+
+def _read_place(x: str, y: str, where: str, labels: tuple[str, str]) -> tuple[float, float]:
+    """Return east and north, or longitude and latitude; NaN of a point that is marked alone, where both are empty."""
+    if x.strip().lower() in NOT_KNOWN and y.strip().lower() in NOT_KNOWN:
+        return math.nan, math.nan
+    return read_number(x, where, labels[0]), read_number(y, where, labels[1])
 
 
 def _sigma(cell: Callable[[str], str], column: str, where: str) -> float | None:
@@ -225,7 +251,10 @@ def _row(
     *,
     role: str = "",
 ) -> _Row:
-    refuse_degrees_out_of_range(crs, x, y, where)
+    if x == x:
+        refuse_degrees_out_of_range(crs, x, y, where)
+    elif not name:
+        raise JaxbaError(f"{where}: a point without coordinates needs a name, by which scale bars call it.")
     point = SurveyedPoint(
         name=name, crs=crs, x=x, y=y, z_m=z_m, marks=(mark,), std_h_m=std_h_m, std_v_m=std_v_m, source=where,
         is_check=is_check_label(name) if not role else role == "check",
@@ -267,4 +296,5 @@ def _points(rows: list[_Row], unnamed: str) -> tuple[SurveyedPoint, ...]:
 
 
 def _place(point: SurveyedPoint) -> tuple:
-    return tuple(getattr(point, field) for field in _PLACE)
+    place = tuple(getattr(point, field) for field in _PLACE)
+    return place if point.is_surveyed else (None, None, None, *place[3:])

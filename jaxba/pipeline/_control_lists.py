@@ -96,8 +96,11 @@ def _is_one_unnamed(first: SurveyedPoint, second: SurveyedPoint) -> bool:
 
 def _joined(first: SurveyedPoint, second: SurveyedPoint) -> SurveyedPoint:
     """Return a point of both lists: one place, the marks of both, the same mark once."""
+    if not (first.is_surveyed and second.is_surveyed):  # marked alone in one of them
+        first = dataclasses.replace(second if second.is_surveyed else first, marks=first.marks)
+        second = dataclasses.replace(second, **{field: getattr(first, field) for field in _PLACE})
     for field in _PLACE:
-        if getattr(first, field) != getattr(second, field):
+        if first.is_surveyed and getattr(first, field) != getattr(second, field):
             raise JaxbaError(
                 f"{second.source}: {second.name} has {field} {getattr(second, field)}, and {getattr(first, field)} in "
                 f"{first.source}; give one value, or two names."

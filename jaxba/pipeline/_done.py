@@ -27,8 +27,8 @@ T = TypeVar("T")
 class Done:
     """What the stages so far have made; None where a stage has not run. `settings`: parameters by section.
 
-    - `geotags`, `gcp`, `check`: name and text of the lists that the run was given.
-    - `found_lists`: those of the three that nobody named, since they lie among the photos. `own_lists`: the files below
+    - `geotags`, `gcp`, `check`, `bars`: name and text of the lists that the run was given.
+    - `found_lists`: those of them that nobody named, since they lie among the photos. `own_lists`: the files below
       the folder of photos that are lists in use.
     - `features_left_out`, `match_left_out`: photos that these stages could not work on.
     """
@@ -38,6 +38,7 @@ class Done:
     geotags: tuple[str, str] | None = None
     gcp: tuple[str, str] | None = None
     check: tuple[str, str] | None = None
+    bars: tuple[str, str] | None = None
     found_lists: tuple[str, ...] = ()
     own_lists: tuple[str, ...] = ()
     metadata: Described | None = None

@@ -91,7 +91,7 @@ def _unknown(adjusted: Adjusted) -> list[str]:
 
 def _files(frame: LocalFrame | None, files: Sequence[str]) -> list[str]:
     """Return a paragraph for each file that was written, in a fixed order."""
-    from jaxba.io import CLOUD_COLUMNS, CONTROL_COLUMNS, SITE_COLUMNS
+    from jaxba.io import BAR_RESULT_COLUMNS, CLOUD_COLUMNS, CONTROL_COLUMNS, SITE_COLUMNS
 
     world = "true east, north, up in metres" if frame is not None else "a frame and scale of its own"
     described: dict[str, tuple[str, Mapping[str, str]]] = {
@@ -125,6 +125,7 @@ def _files(frame: LocalFrame | None, files: Sequence[str]) -> list[str]:
             {},
         ),
         "control.csv": ("control and check points", CONTROL_COLUMNS),
+        "bars.csv": ("scale bars: known distances between marked points", BAR_RESULT_COLUMNS),
         "colmap": (
             f"the model for COLMAP, as text and binary; its world is {world}, which frame.json describes. POINT3D_ID "
             "is PointID of cloud.csv",

@@ -47,12 +47,13 @@ def run_pipeline(
     geotags: Path | None = None,
     gcp: Path | None = None,
     check: Path | None = None,
+    bars: Path | None = None,
     tell: Callable[[Event], None] = lambda event: None,
 ) -> Run:
     """Run the pipeline on a folder of photos, up to and with the stage `until`; what is unchanged is not run again.
 
     - `out`: the project folder. `settings`: parameters by stage. `geotags`: a list that replaces the photos' tags.
-    - `gcp`, `check`: lists of control and of check points.
+    - `gcp`, `check`: lists of control and of check points. `bars`: of scale bars.
 
     Photos are worked on in new processes, which import the script that calls this: it must do so under
     `if __name__ == "__main__":`.
@@ -67,7 +68,7 @@ def run_pipeline(
     project = Project(out)
     with locked(project.folder):
         project.remove_leftovers()
-        given = Given(photos=photos, geotags=geotags, gcp=gcp, check=check)
+        given = Given(photos=photos, geotags=geotags, gcp=gcp, check=check, bars=bars)
         try:
             done = Done(files=project.photo_files(photos), settings=settings, **read_lists(given))
             project.write_text(SETTINGS, to_toml(settings))

@@ -43,6 +43,7 @@ def _control(done: Done) -> control.Inputs:
         target_crs=made(done.crs).target_crs,
         gcp=done.gcp,
         check=done.check,
+        bars=done.bars,
         is_gcp_found="gcp" in done.found_lists,
     )
 
@@ -208,6 +209,7 @@ def _adjust(done: Done) -> adjust.Inputs:
         block=block,
         features=made(done.features),
         control=made(done.control).control,
+        bars=made(done.control).bars,
         chunk_size=tiles.chunk_size if block.num_images > tiles.chunk_size else None,
     )
 
@@ -215,7 +217,11 @@ def _adjust(done: Done) -> adjust.Inputs:
 def _export(done: Done) -> export.Inputs:
     placed = made(done.control)
     return export.Inputs(
-        photos=done.photos, reference=placed.reference, adjusted=made(done.adjust), control=placed.control
+        photos=done.photos,
+        reference=placed.reference,
+        adjusted=made(done.adjust),
+        control=placed.control,
+        bars=placed.bars,
     )
 
 

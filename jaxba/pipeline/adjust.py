@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._room import Room
 from jaxba.engine._words import many
-from jaxba.report import Told, control_facts, flight_facts, flight_lines, grouped, sentences
+from jaxba.report import Told, bar_facts, control_facts, flight_facts, flight_lines, grouped, sentences
 from jaxba.scene import (
+    BarFit,
     Block,
     CommonOffset,
     Control,
@@ -23,6 +24,7 @@ from jaxba.scene import (
     Photo,
     PrunedEdge,
     Reference,
+    ScaleBars,
     Tracks,
     ViewGraph,
     described,
@@ -34,7 +36,7 @@ class Inputs:
     """- `photos`, `reference`, `view_graph`, `tracks`, `block`: of the stages before.
 
     - `features`: of every photo, by its index, to complete tracks from; opened one after the other.
-    - `control`: surveyed points.
+    - `control`: surveyed points. `bars`: known distances between marked points.
     - `chunk_size`: images of a tile, for a block that has more; None for one that has not.
     """
 
@@ -45,6 +47,7 @@ class Inputs:
     block: Block
     features: Mapping[int, Features] = field(default_factory=dict)
     control: Control = field(default_factory=Control.nothing)
+    bars: ScaleBars = field(default_factory=ScaleBars.nothing)
     chunk_size: int | None = None
 
 
@@ -90,7 +93,7 @@ class Outputs:
     - `common`: what positions have in common as an unknown, and its prior sigma; None where it was none.
     - `flights`: what positions of each flight are off in common; None where flights are not told apart.
     - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
-    - `mark_std_px`: sigma of a mark that weighed them.
+    - `mark_std_px`: sigma of a mark that weighed them. `bars`: how the scale bars fit.
     - `affine`: 3 x 4, what coordinates take beside the block, of `control.method=affine`; else the identity.
     - `findings`: what a surveyor should know, in figures: ambiguities, contradictions, bounds reached.
     """
@@ -119,6 +122,7 @@ class Outputs:
     control: ControlFit = field(default_factory=ControlFit.nothing)
     mark_used: Bool[np.ndarray, " marks"] = field(default_factory=lambda: np.zeros(0, bool))
     mark_std_px: float = 1.0
+    bars: BarFit = field(default_factory=BarFit.nothing)
     spread: float = 1.0
     loss: str = "linear"
     loss_f_scale: float = 1.0
@@ -158,6 +162,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         inputs.features or None,
         inputs.control,
         tiling,
+        inputs.bars,
     )
     sigmas = sfm.uncertainty(adjusted, reference)
     flights = sfm.flight_offsets(adjusted, sigmas, reference)
@@ -181,7 +186,12 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         lambda: sfm.control_findings(adjusted, control, controlled.fit, reference, photos),
         (),
     )
-    found = (*on_control, *found, *(Finding.of("note", text=f"{note}.") for note in notes))
+    found = (
+        *on_control,
+        *sfm.bar_findings(inputs.bars, adjusted.bars, block),
+        *found,
+        *(Finding.of("note", text=f"{note}.") for note in notes),
+    )
     total = np.bincount(block.observation_point, adjusted.error_px, minlength=block.num_points)
     return Outputs(
         block=block,
@@ -208,6 +218,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         control=controlled.fit,
         mark_used=adjusted.mark_used,
         mark_std_px=adjusted.mark_std_px,
+        bars=adjusted.bars,
         spread=adjusted.spread,
         loss=params.loss,
         loss_f_scale=float(adjusted.loss.f_scale) / adjusted.spread,
@@ -253,6 +264,9 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
         "findings": sentences(outputs.findings),
         "edges_left_out": [dataclasses.asdict(edge) for edge in outputs.pruned],
     }
-    if not told.control.num_points:
-        return {"adjust": adjusted}
-    return {"adjust": adjusted, "control": control_facts(told.control, outputs.control)}
+    found: dict[str, Any] = {"adjust": adjusted}
+    if told.bars.num:
+        found["bars"] = bar_facts(told.bars, outputs.bars)
+    if told.control.num_points:
+        found["control"] = control_facts(told.control, outputs.control)
+    return found

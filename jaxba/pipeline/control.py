@@ -7,24 +7,27 @@ check point then, with the marks of both.
 
 Where no photo has a position, the control points place the local frame, and their CRS is that of the results unless
 another is given. Without a list the reference passes through.
+
+Points without coordinates are marked for scale bars alone, which call their ends by name.
 """
 
 import dataclasses
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.io import SurveyedPoint
+from jaxba.pipeline._bar_ends import bars_of
 from jaxba.pipeline._control_lists import heights_of_points, points_of_lists
 from jaxba.pipeline._mark_turn import expected_px
 from jaxba.pipeline._marks import marks_in_photos
-from jaxba.report import Told, control_facts, control_lines, reference_facts
-from jaxba.scene import Control, LeftOut, LocalFrame, Photo, Reference
+from jaxba.report import Told, bar_facts, control_facts, control_lines, reference_facts
+from jaxba.scene import Control, LeftOut, LocalFrame, Photo, Reference, ScaleBars
 
 _ASSUMED_MARK_STD_PX = 1.0
 _LEAST_FIT = {"helmert": 3, "affine": 4}  # control points that are marked twice
@@ -34,8 +37,8 @@ _LEAST_FIT = {"helmert": 3, "affine": 4}  # control points that are marked twice
 class Inputs:
     """- `photos`, `reference`: of the stages before. `target_crs`: that was asked for.
 
-    - `gcp`, `check`: name and text of the lists; None where there is none. `is_gcp_found`: nobody named `gcp`, which
-      lies among the photos.
+    - `gcp`, `check`, `bars`: name and text of the lists; None where there is none. `is_gcp_found`: nobody named `gcp`,
+      which lies among the photos.
     """
 
     photos: tuple[Photo, ...]
@@ -43,6 +46,7 @@ class Inputs:
     target_crs: str | None = None
     gcp: tuple[str, str] | None = None
     check: tuple[str, str] | None = None
+    bars: tuple[str, str] | None = None
     is_gcp_found: bool = False
 
 
@@ -58,6 +62,7 @@ class Params(Parameters):
     check: str | None = parameter(None, help="names of points that are check points, such as gcp03, gcp07")
     std_h: float = parameter(0.02, low=0.001, high=10, help="sigma east and north of a point that states none, metres")
     std_v: float = parameter(0.03, low=0.001, high=20, help="sigma of its height, metres")
+    bar_std: float = parameter(0.005, low=1e-5, high=1, help="sigma of a scale bar that states none, metres")
     mark_std_px: float | None = parameter(
         None, low=0.05, high=20, help="sigma of a mark an axis, px; none: as the marks of each point scatter about it"
     )
@@ -87,11 +92,13 @@ class Params(Parameters):
 class Outputs:
     """- `reference`: with a frame from the control points where the photos have none. `control`: the points.
 
+    - `bars`: the scale bars, with the marks of their ends.
     - `left_out`: marks and points that cannot be used, with the reason. `notes`: what was found and decided.
     """
 
     reference: Reference
     control: Control
+    bars: ScaleBars = field(default_factory=ScaleBars.nothing)
     left_out: tuple[LeftOut, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -103,6 +110,11 @@ def run(inputs: Inputs, params: Params) -> Outputs:
     photos; for marks whose scale is not known; and where the method needs more control points.
     """
     if inputs.gcp is None and inputs.check is None:
+        if inputs.bars is not None:
+            raise JaxbaError(
+                f"{inputs.bars[0]}: no list marks the ends of scale bars in photos; give one as --gcp, in which a "
+                "point may have no coordinates."
+            )
         return Outputs(reference=inputs.reference, control=Control.nothing())
     if inputs.gcp is None or not inputs.is_gcp_found:
         return _placed(inputs, params)
@@ -118,20 +130,65 @@ def run(inputs: Inputs, params: Params) -> Outputs:
 
 
 def _placed(inputs: Inputs, params: Params) -> Outputs:
-    """Return the points of the lists in the local frame."""
-    from jaxba import geo  # loads pyproj
-
+    """Return the points of the lists in the local frame, and the scale bars."""
     names = " and ".join(entry[0] for entry in (inputs.gcp, inputs.check) if entry is not None)
-    points, notes = points_of_lists(inputs.gcp, inputs.check, params.check, inputs.photos)
+    every, notes = points_of_lists(inputs.gcp, inputs.check, params.check, inputs.photos)
     before_marks = len(notes)
+    every.sort(key=lambda point: not point.is_surveyed)
+    points = [point for point in every if point.is_surveyed]
     mark = functools.partial(
         marks_in_photos,
-        points,
+        every,
         inputs.photos,
         params.mark_width_px,
         names,
         orientation=params.mark_orientation,
     )
+    placed = _Placed(inputs.reference, None, None)
+    if points:
+        placed = _surveyed(inputs, params, points, names, notes)
+    xyz_m = np.full((len(every), 3), np.nan)
+    if placed.xyz_m is not None:
+        xyz_m[: len(points)] = placed.xyz_m
+    expected = functools.partial(expected_px, inputs.photos, inputs.reference, xyz_m)
+    found = mark() if placed.reference.frame is None else mark(expected=expected)
+    notes[before_marks:before_marks] = found.notes
+    mark_std_px = _ASSUMED_MARK_STD_PX if params.mark_std_px is None else params.mark_std_px
+    assumed = params.mark_std_px is None
+    bars, told = bars_of(inputs.bars, every, found, params.bar_std, mark_std_px, is_assumed=assumed)
+    notes += told
+    control = dataclasses.replace(Control.nothing(), method=params.method)
+    left = list(found.left_out)
+    if placed.xyz_m is not None and placed.std_m is not None:
+        mine = found.point < len(points)
+        control = Control(
+            names=tuple(point.name for point in points),
+            xyz_m=placed.xyz_m,
+            std_m=placed.std_m,
+            is_check=np.array([point.is_check for point in points]),
+            mark_point=found.point[mine],
+            mark_image=found.image[mine],
+            mark_xy_px=found.xy_px[mine],
+            mark_std_px=mark_std_px,
+            mark_std_is_assumed=assumed,
+            method=params.method,
+        )
+        _refuse_too_few(control, params.method, names)
+    left += _weak(control)
+    return Outputs(reference=placed.reference, control=control, bars=bars, left_out=tuple(left), notes=tuple(notes))
+
+
+class _Placed(NamedTuple):
+    """The reference with a frame, if there is one, and surveyed points in it, with their sigmas."""
+
+    reference: Reference
+    xyz_m: np.ndarray | None
+    std_m: np.ndarray | None
+
+
+def _surveyed(inputs: Inputs, params: Params, points: Sequence[SurveyedPoint], names: str, notes: list[str]) -> _Placed:
+    from jaxba import geo  # loads pyproj
+
     xyz = np.array([[point.x, point.y, np.nan if point.z_m is None else point.z_m] for point in points])
     xyz[:, 2] = heights_of_points(points, params.heights, names, notes)
     frame = inputs.reference.frame
@@ -152,10 +209,7 @@ def _placed(inputs: Inputs, params: Params) -> Outputs:
     elif params.method != "none" and np.isfinite(xyz[~is_check, 2]).any():
         reference = dataclasses.replace(reference, frame=_with_trusted_heights(frame, geo.UNTRUSTED))
     if frame is None:
-        found = mark()
-        notes[before_marks:before_marks] = found.notes
-        nothing = dataclasses.replace(Control.nothing(), method=params.method)
-        return Outputs(reference=reference, control=nothing, left_out=found.left_out, notes=tuple(notes))
+        return _Placed(reference, None, None)
     height_m, told = geo.heights_above(frame.height_datum, surveyed, names)
     notes += told
     known = np.isfinite(height_m)
@@ -167,28 +221,12 @@ def _placed(inputs: Inputs, params: Params) -> Outputs:
         frame, surveyed.longitude_deg, surveyed.latitude_deg, np.where(known, height_m, frame.height_m)
     )
     _refuse_far(xyz_m, xyz, points, inputs.reference, frame, params, names)
-    found = mark(expected=functools.partial(expected_px, inputs.photos, inputs.reference, xyz_m))
-    notes[before_marks:before_marks] = found.notes
-    control = Control(
-        names=tuple(point.name for point in points),
-        xyz_m=xyz_m,
-        std_m=np.stack([std_h, std_h, np.where(known, std_v, np.inf)], axis=1),
-        is_check=is_check,
-        mark_point=found.point,
-        mark_image=found.image,
-        mark_xy_px=found.xy_px,
-        mark_std_px=_ASSUMED_MARK_STD_PX if params.mark_std_px is None else params.mark_std_px,
-        mark_std_is_assumed=params.mark_std_px is None,
-        method=params.method,
-    )
-    left = [*found.left_out, *_weak(control)]
-    _refuse_too_few(control, params.method, names)
-    return Outputs(reference=reference, control=control, left_out=tuple(left), notes=tuple(notes))
+    return _Placed(reference, xyz_m, np.stack([std_h, std_h, np.where(known, std_v, np.inf)], axis=1))
 
 
 def lines(outputs: Outputs, told: Told) -> list[str]:
     """Return what was made, in words."""
-    return control_lines(outputs.control, outputs.notes, outputs.left_out)
+    return control_lines(outputs.control, outputs.notes, outputs.left_out, outputs.bars)
 
 
 def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
@@ -198,6 +236,8 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
         left = [{"name": entry.name, "reason": entry.reason} for entry in outputs.left_out]
         points = control_facts(outputs.control)
         found["control"] = {"asked_method": outputs.control.method, "left_out": left, **points}
+    if outputs.bars.num:
+        found["bars"] = bar_facts(outputs.bars)
     return found
 
 

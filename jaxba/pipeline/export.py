@@ -18,15 +18,16 @@ from jaxba.engine._store import sha256
 from jaxba.engine._words import many
 from jaxba.pipeline import adjust
 from jaxba.pipeline._export_readme import readme, why_empty
-from jaxba.report import Accuracy, Told, accuracy, accuracy_row
-from jaxba.scene import Block, Control, LocalFrame, Photo, Reference, described
+from jaxba.report import Accuracy, Told, accuracy, accuracy_row, bar_facts
+from jaxba.scene import Block, Control, LocalFrame, Photo, Reference, ScaleBars, described
 
 _README = "README.txt"
+_WORLD = {False: "arbitrary frame and scale", True: "arbitrary frame, in metres by scale bars"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """- `photos`, `reference`, `adjusted`, `control`: of the stages before.
+    """- `photos`, `reference`, `adjusted`, `control`, `bars`: of the stages before.
 
     - `folder`: empty; the stage's files go there.
     """
@@ -36,6 +37,7 @@ class Inputs:
     adjusted: adjust.Outputs
     folder: Path = Path()
     control: Control = field(default_factory=Control.nothing)
+    bars: ScaleBars = field(default_factory=ScaleBars.nothing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +91,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         io.write_las(folder / "cloud.laz", cloud, crs, date=date)
         _write_sites(inputs, frame, crs, date)
         _write_control(inputs, frame)
-    _write_colmap(folder / "colmap", block, photos, adjusted.point_error_px, frame, inputs.photos)
+    if inputs.bars.num:
+        io.write_csv_bars(folder / "bars.csv", bar_facts(inputs.bars, adjusted.bars))
+    _write_colmap(folder / "colmap", inputs, photos, frame)
     gnss = inputs.reference.xyz_m[block.image_index], inputs.reference.std_m[block.image_index]
     io.write_opensfm(folder / "reconstruction.json", block, photos, frame, *gnss)
     notes = [*_notes(inputs, frame), *_name_notes(photos), *_write_tile(inputs)]
@@ -196,24 +200,23 @@ def _write_control(inputs: Inputs, frame: LocalFrame) -> None:
     io.write_csv_control(inputs.folder / "control.csv", table)
 
 
-def _write_colmap(
-    folder: Path,
-    block: Block,
-    photos: list[Photo],
-    error_px: Float[np.ndarray, " points"],
-    frame: LocalFrame | None,
-    all_photos: tuple[Photo, ...],
-) -> None:
+def _write_colmap(folder: Path, inputs: Inputs, photos: list[Photo], frame: LocalFrame | None) -> None:
     from jaxba import io
 
+    block, error_px = inputs.adjusted.block, inputs.adjusted.point_error_px
     names = [photo.name for photo in photos]
-    sizes = _camera_sizes(block, all_photos)
+    sizes = _camera_sizes(block, inputs.photos)
     io.write_colmap_binary(folder / "binary", block, names, sizes, error_px)
     io.write_colmap_text(folder / "text", block, names, sizes, error_px)
-    world: dict[str, Any] = {"world": "arbitrary frame and scale"}
+    world: dict[str, Any] = {"world": _WORLD[_is_scaled(inputs)]}
     if frame is not None:
         world = {"world": "local east, north, up in metres around the origin", "origin": dataclasses.asdict(frame)}
     _write(folder / "frame.json", (json.dumps(world, indent=1) + "\n").encode())
+
+
+def _is_scaled(inputs: Inputs) -> bool:
+    """Whether scale bars alone have told the block's scale."""
+    return not inputs.adjusted.block.is_georeferenced and bool(inputs.adjusted.bars.is_used.any())
 
 
 def _camera_sizes(block: Block, photos: tuple[Photo, ...]) -> Int[np.ndarray, "cameras 2"]:
@@ -229,22 +232,24 @@ def _write_tile(inputs: Inputs) -> list[str]:
     from jaxba.ba import PRIORS
     from jaxba.geometry import LOSSES
     from jaxba.io import write_tile
-    from jaxba.sfm import control_part, to_problem, weighed
+    from jaxba.sfm import add_bars, control_part, to_problem, weighed
 
     adjusted = inputs.adjusted
     block = adjusted.block
     control = dataclasses.replace(inputs.control, mark_std_px=adjusted.mark_std_px)
+    part = control_part(block, control, adjusted.mark_used, adjusted.control.used_std_m)
     problem = to_problem(
         block,
         inputs.reference,
         inputs.photos,
         std_px=adjusted.std_px,
         position_scale=adjusted.position_scale,
-        control=control_part(block, control, adjusted.mark_used, adjusted.control.used_std_m),
+        control=part,
         common=adjusted.common,
     )
     if adjusted.flights is not None:
         problem = dataclasses.replace(problem, position_offset=np.nan_to_num(adjusted.flights.offset_m))
+    problem = add_bars(problem, block, inputs.bars, adjusted.bars.is_used, control, part)
     problem = weighed(problem, adjusted.spread, block.num_observations)
     known = tuple(prior for prior in problem.priors if type(prior) in PRIORS.values())
     left = [prior.name for prior in problem.priors if type(prior) not in PRIORS.values()]
@@ -278,7 +283,7 @@ def _picture(inputs: Inputs, cloud: Any, frame: LocalFrame | None) -> bytes:
             camera_xyz=_in_crs(frame, _mapped(inputs, block.centers_m))[list(order)],
             title=f"{block.num_images} of {len(inputs.photos)} photos, {block.num_points:,} points",
             subtitle=figures,
-            crs="arbitrary frame and scale" if frame is None else _named(frame),
+            crs=_WORLD[_is_scaled(inputs)] if frame is None else _named(frame),
             unit=unit,
             height_label="Z" if frame is None else f"height ({_short(frame.height_unit)}, {_above(frame)})",
         )
@@ -314,11 +319,12 @@ def _notes(inputs: Inputs, frame: LocalFrame | None) -> list[str]:
                 "similarity alone."
             )
         return notes
+    own = "a frame, in metres by scale bars," if _is_scaled(inputs) else "a frame and scale"
     why = "no photo has a position that can be used"
     if inputs.reference.frame is not None:
         why = "the block could not be placed by the photos' positions or control points"
     return [
-        f"No coordinates on earth: {why}. Clouds and cameras are in a frame and scale of their own, without an EPSG "
+        f"No coordinates on earth: {why}. Clouds and cameras are in {own} of their own, without an EPSG "
         "code; cloud.laz, cameras.gpkg and cameras.geojson, which need a CRS, are left out. "
         "Give positions with geo.txt, or control points with --gcp."
     ]

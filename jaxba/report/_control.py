@@ -7,19 +7,22 @@ from typing import Any
 import numpy as np
 
 from jaxba.engine._words import many
-from jaxba.scene import Control, ControlFit, LeftOut
+from jaxba.scene import Control, ControlFit, LeftOut, ScaleBars
 
 _SHOWN = 10
 _AXES = ("east", "north", "up")
 
 
-def control_lines(control: Control, notes: Sequence[str], left_out: Sequence[LeftOut]) -> list[str]:
+def control_lines(control: Control, notes: Sequence[str], left_out: Sequence[LeftOut], bars: ScaleBars) -> list[str]:
     """Return what there is of control in a line, then the notes on it and what cannot be used."""
-    if not control.num_points and not notes:
+    if not control.num_points and not notes and not bars.num:
         return ["no list of control points"]
     checks = int(control.is_check.sum())
     count = control.num_points - checks
-    first = f"{many(count, 'control point')}, {many(checks, 'check point')}; {many(len(control.mark_point), 'mark')}"
+    first = f"{many(count, 'control point')}, {many(checks, 'check point')}"
+    if bars.num:
+        first = f"{first}, {many(bars.num, 'scale bar')}"
+    first = f"{first}; {many(len(control.mark_point), 'mark')}"
     images = len(np.unique(control.mark_image))
     left = [f"Left out: {entry.name}: {entry.reason}." for entry in left_out]
     if len(left) > _SHOWN:

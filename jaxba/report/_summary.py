@@ -7,14 +7,16 @@ from typing import Any
 
 from jaxba.engine._stage import Stage, left_out
 from jaxba.report._told import Told
-from jaxba.scene import Control, LeftOut, described
+from jaxba.scene import Control, LeftOut, ScaleBars, described
 
 
 def told_of(done: Any, left_out: tuple[LeftOut, ...] = ()) -> Told:
     """Return what the stages' `lines` and `facts` need, from what is done so far. `left_out`: by the stage in hand."""
     names = () if done.metadata is None else tuple(photo.name for photo in done.photos)
-    control = Control.nothing() if done.control is None else done.control.control
-    return Told(photos=names, left_out=left_out, control=control)
+    control, bars = Control.nothing(), ScaleBars.nothing()
+    if done.control is not None:
+        control, bars = done.control.control, done.control.bars
+    return Told(photos=names, left_out=left_out, control=control, bars=bars)
 
 
 def summary(

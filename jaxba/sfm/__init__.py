@@ -1,6 +1,8 @@
 """Structure from motion: start values of poses and points, and the adjustment in rounds (arrays in, arrays out)."""
 
 from jaxba.sfm._adjust import Adjusted, adjust
+from jaxba.sfm._bar_ends import add_bars
+from jaxba.sfm._bar_findings import bar_findings
 from jaxba.sfm._control import agreeing_marks, control_part
 from jaxba.sfm._control_findings import control_findings
 from jaxba.sfm._control_fit import Controlled, apply_affine, apply_control
@@ -16,8 +18,9 @@ from jaxba.sfm._spread import weighed
 from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [
-    "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Tiling", "Uncertainty", "adjust", "agreeing_marks",
-    "apply_affine", "apply_control", "control_findings", "control_part", "findings", "flight_offsets",
-    "free_parameters", "gnss_fit", "height_above_ground", "initialise", "intrinsics_at_bounds", "place_by_control",
-    "positions_hold", "to_problem", "transformed", "uncertainty", "weighed", "with_points", "without_offsets",
+    "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Tiling", "Uncertainty", "add_bars", "adjust",
+    "agreeing_marks", "apply_affine", "apply_control", "bar_findings", "control_findings", "control_part", "findings",
+    "flight_offsets", "free_parameters", "gnss_fit", "height_above_ground", "initialise", "intrinsics_at_bounds",
+    "place_by_control", "positions_hold", "to_problem", "transformed", "uncertainty", "weighed", "with_points",
+    "without_offsets",
 ]  # fmt: skip

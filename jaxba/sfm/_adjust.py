@@ -16,6 +16,7 @@ import dataclasses
 import functools
 import logging
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,12 +24,27 @@ from jaxtyping import Bool, Float
 from jaxba._errors import JaxbaError
 from jaxba.ba import Problem, Solution
 from jaxba.geometry import AbstractLoss
-from jaxba.scene import Block, CommonOffset, Control, Features, LeftOut, Photo, PrunedEdge, Reference, Tracks, ViewGraph
+from jaxba.scene import (
+    BarFit,
+    Block,
+    CommonOffset,
+    Control,
+    Features,
+    LeftOut,
+    Photo,
+    PrunedEdge,
+    Reference,
+    ScaleBars,
+    Tracks,
+    ViewGraph,
+)
 from jaxba.sfm._complete import complete_tracks
 from jaxba.sfm._control import ControlPart, Standing, agreeing_marks, mark_std
+from jaxba.sfm._control_start import transformed
 from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, without_edges
 from jaxba.sfm._intrinsics import free_parameters
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
+from jaxba.sfm._onto_bars import onto_bars, scaling
 from jaxba.sfm._onto_control import OnControl, onto_control
 from jaxba.sfm._points import apply_points, triangulate_tracks
 from jaxba.sfm._rounds import Rounds, Settings, Solved, Tiling, without_images
@@ -55,6 +71,7 @@ class Adjusted:
       tests said. `mark_used`: of all marks, those that agree with the others of their point.
     - `mark_std_px`: sigma of marks.
     - `common_m`: what measured positions are off in common, as far as control tells it.
+    - `bars`: how the block fits its scale bars.
     - `max_memory`: that solving in tiles was allowed; None in one piece.
     - `pruned`: edges left out. `lost`: images that had too few observations left. `notes`: what else was decided.
     """
@@ -77,6 +94,7 @@ class Adjusted:
     common_m: Float[np.ndarray, "3"]
     control: ControlPart | None = None
     on_control: OnControl | None = None
+    bars: BarFit = dataclasses.field(default_factory=BarFit.nothing)
     max_memory: float | str | None = None
 
     @functools.cached_property
@@ -105,11 +123,12 @@ def adjust(
     features: Mapping[int, Features] | None = None,
     control: Control | None = None,
     tiling: Tiling | None = None,
+    bars: ScaleBars | None = None,
 ) -> Adjusted:
     """Return the adjusted block; `block` holds the start values, with points or without.
 
     - `features`: of every image, by index, to complete tracks from; without them tracks stay as they are.
-    - `control`: surveyed points; its check points take no part. `tiling`: of large blocks.
+    - `control`: surveyed points; its check points take no part. `tiling`: of large blocks. `bars`: known distances.
 
     Raises `JaxbaError` where the block has fewer than two images, or no point of it is left.
     """
@@ -205,6 +224,16 @@ def adjust(
         return solve(block, std_px, max_nfev=settings.max_nfev, ftol=settings.ftol, standing=standing)
 
     solved, on_control = onto_control(solved, std_px, reference, control, max_memory, stand)
+    standing = None if on_control is None else on_control.standing
+    bars = ScaleBars.nothing() if bars is None else bars
+
+    def stand_on_bars(block: Block, use: Bool[np.ndarray, " bars"], factor: float) -> Solved:
+        scaled = dataclasses.replace(rounds, anchor=transformed(rounds.anchor, scaling(factor)))
+        solve = functools.partial(scaled.solve, free=every, mark_used=mark_used, shape=shape, number=len(medians))
+        stops: dict[str, Any] = {"max_nfev": settings.max_nfev, "ftol": settings.ftol}
+        return solve(block, std_px, standing=standing, bars=(bars, use), **stops)
+
+    solved, bar_fit = onto_bars(solved, bars, std_px, control, max_memory, stand_on_bars)
     block, medians[-1] = solved.block, float(np.median(solved.error_px))
     return Adjusted(
         block=dataclasses.replace(block, unregistered=(*block.unregistered, *lost)),
@@ -225,6 +254,7 @@ def adjust(
         common_m=solved.common_m,
         control=solved.control,
         on_control=on_control,
+        bars=bar_fit,
         max_memory=max_memory,
     )
 

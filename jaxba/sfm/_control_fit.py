@@ -105,7 +105,7 @@ def apply_control(adjusted: Adjusted, sigmas: Uncertainty, control: Control, ref
         points = points.copy()
         points[adjusted.control.rows] = adjusted.control.start_m
         if sigmas.covariance is not None:
-            own = sigmas.covariance.points[block.num_points :]
+            own = sigmas.covariance.points[block.num_points :][: len(adjusted.control.rows)]
             variance[adjusted.control.rows] = np.maximum(np.einsum("nii->ni", own), 0.0)
     residual = np.where(np.isfinite(control.std_m), points - control.xyz_m, np.nan)
     with np.errstate(invalid="ignore"):

@@ -15,7 +15,7 @@ def flight_offsets(adjusted: Adjusted, sigmas: Uncertainty, reference: Reference
     flights = flights_of(adjusted.block, reference)
     if flights is None:
         return None
-    offset_m = np.asarray(adjusted.problem.position_offset, float)
+    offset_m = np.asarray(adjusted.problem.position_offset, float)[: len(flights[0])]
     std_m = np.full(offset_m.shape, np.nan)
     if sigmas.covariance is not None:
         std_m = np.sqrt(np.maximum(np.diagonal(sigmas.covariance.position_offset), 0.0)).reshape(-1, 3)

@@ -20,7 +20,8 @@ from jaxtyping import Bool, Float
 
 from jaxba.ba import HistoryStep, PlanShape, Problem, Solution, make_plan, reprojection_errors, solve, solve_tiled
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
-from jaxba.scene import Block, Control, Photo, Reference, Tracks
+from jaxba.scene import Block, Control, Photo, Reference, ScaleBars, Tracks
+from jaxba.sfm._bar_ends import add_bars
 from jaxba.sfm._control import ControlPart, Standing, before_control, control_part
 from jaxba.sfm._measured import position_scale
 from jaxba.sfm._points import track_rows
@@ -110,11 +111,13 @@ class Rounds:
         ftol: float,
         number: int,
         standing: Standing | None = None,
+        bars: tuple[ScaleBars, Bool[np.ndarray, " bars"]] | None = None,
     ) -> Solved:
         """Solve a block; `free` are the camera's parameters that may change, `shape` is of `shape`.
 
         - `mark_used`: of all marks of control. `number`: of the round, from 1.
-        - `standing`: of control and positions; None where control does not hold the block.
+        - `standing`: of control and positions; None where control does not hold the block. `bars`: all, and which of
+          them hold it.
         """
         settings = self.settings
         model = LOSSES[settings.loss]
@@ -131,7 +134,7 @@ class Rounds:
         held = [name for name in CAMERAS[block.camera_model].parameter_names() if name not in free]
 
         def problem_of(block: Block, control: ControlPart | None) -> Problem:
-            return to_problem(
+            problem = to_problem(
                 block,
                 self.reference,
                 self.photos,
@@ -143,6 +146,7 @@ class Rounds:
                 control=control,
                 common=common,
             )
+            return problem if bars is None else add_bars(problem, block, *bars, self.control, control)
 
         problem = problem_of(block, control)
         stops: dict[str, Any] = {"max_nfev": max_nfev, "ftol": ftol, "xtol": settings.xtol}
@@ -165,7 +169,8 @@ class Rounds:
         num_points, num_own = block.num_points, block.num_observations
         block = with_solution(block, solution)
         if control is not None:
-            control = dataclasses.replace(control, start_m=np.asarray(solution.points)[num_points:])
+            of_control = slice(num_points, num_points + len(control.rows))
+            control = dataclasses.replace(control, start_m=np.asarray(solution.points)[of_control])
         problem = solution.apply(problem)
         error_px = reprojection_errors(problem)
         fits = np.isfinite(error_px)
@@ -173,9 +178,10 @@ class Rounds:
             fits &= ~solution.report.dropped.observations
         if not fits[:num_own].all():
             block = with_observations(block, fits[:num_own])
-            problem = dataclasses.replace(
-                problem_of(block, control), position_offset=np.asarray(solution.position_offset)
-            )
+            problem = problem_of(block, control)
+            offset_m = np.array(solution.position_offset)
+            offset_m[len(offset_m) - problem.num_bar_ends :] = 0.0  # counted from where the ends lie now
+            problem = dataclasses.replace(problem, position_offset=offset_m)
             error_px = reprojection_errors(problem)
         error_px = error_px[: block.num_observations]
         common_m = np.zeros(3) if common is None else np.asarray(solution.position_offset)[0]

@@ -19,6 +19,7 @@ from jaxba.ba import (
     PositionOffsetPrior,
     PositionPrior,
     Problem,
+    with_scale_bars,
 )
 from jaxba.geometry import (
     BAL,
@@ -187,6 +188,12 @@ def small_problem(
         return problem
     offset = np.array([[0.01, -0.02, 0.04], [-0.01, 0.03, 0.02]]), np.array(True)
     return eqx.tree_at(lambda p: (p.position_offset, p.free.position_offset), problem, offset)
+
+
+def with_bars(problem: Problem) -> Problem:
+    """Return a problem with two scale bars, which have a point in common and are longer and shorter than they look."""
+    apart_m = np.linalg.norm(problem.points[[2, 9]] - problem.points[[9, 5]], axis=1)
+    return with_scale_bars(problem, [2, 9], [9, 5], apart_m + np.array([0.15, -0.2]), [0.02, 0.05])
 
 
 def of_flights(images: np.ndarray, num_images: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from quick_jit import quick_jit
-from small_problems import EVERY_CAMERA, RADIAL, small_problem
+from small_problems import EVERY_CAMERA, RADIAL, small_problem, with_bars
 
 import jaxba
 from jaxba import JaxbaError, Problem
@@ -30,8 +30,8 @@ SIMPLE = EVERY_CAMERA[0]
 TIGHT = {"ftol": 0.0, "xtol": 1e-11, "gtol": 0.0, "max_nfev": 60}
 # at the truth, where the second derivatives are positive definite and the gradient is not zero
 CASES = {
-    "shared camera, every prior": lambda: small_problem(
-        RADIAL, lever_arm=True, position_offset=True, prior_loss=Cauchy(2.0), at_truth=True
+    "shared camera, every prior": lambda: with_bars(
+        small_problem(RADIAL, lever_arm=True, position_offset=True, prior_loss=Cauchy(2.0), at_truth=True)
     ),
     "two cameras, fixed blocks": lambda: small_problem(RADIAL, num_cameras=2, at_truth=True, seed=2).fix(
         poses=[1], points=[2, 3], intrinsics=["k2"]

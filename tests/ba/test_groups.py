@@ -9,13 +9,13 @@ from dense_reference import start_of
 from jax import Array
 from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
-from small_problems import EVERY_CAMERA, small_problem
+from small_problems import EVERY_CAMERA, small_problem, with_bars
 
 from jaxba.ba import AbstractPrior, AspectPrior, AttitudePrior, Rows, Step, Unknowns
 from jaxba.ba.groups import PRIORS, Reprojection
 from jaxba.geometry import Pose
 
-PROBLEM = small_problem(EVERY_CAMERA[3], num_cameras=2, lever_arm=True, position_offset=True)
+PROBLEM = with_bars(small_problem(EVERY_CAMERA[3], num_cameras=2, lever_arm=True, position_offset=True))
 UNKNOWNS = start_of(PROBLEM)
 
 

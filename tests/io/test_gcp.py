@@ -175,3 +175,27 @@ def test_a_csv_may_stand_below_a_crs_and_its_header_in_a_comment():
 def test_one_accuracy_is_that_of_all_axes():
     (point,) = parse_control("# EPSG:32615\nname,x,y,z,px,py,image,Accuracy (m)\np,1,2,3,4,5,a.jpg,0.02").points
     assert (point.std_h_m, point.std_v_m) == (0.02, 0.02)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "EPSG:32615\nNaN NaN NaN 10 20 a.jpg t1\nnan nan nan 11 21 b.jpg t1\n1 2 3 12 22 a.jpg gcp01\n",
+        "# EPSG:32615\nname,x,y,z,px,py,image\nt1,,,,10,20,a.jpg\nt1,,,,11,21,b.jpg\ngcp01,1,2,3,12,22,a.jpg\n",
+    ],
+)
+def test_a_point_without_coordinates_has_marks_alone(text: str) -> None:
+    target, point = parse_control(text).points
+    assert (target.name, target.is_surveyed, target.crs, len(target.marks)) == ("t1", False, "", 2)
+    assert (point.name, point.is_surveyed, point.x, point.crs) == ("gcp01", True, 1.0, "EPSG:32615")
+
+
+def test_a_list_of_marks_alone_needs_no_crs_and_each_point_a_name() -> None:
+    (target,) = parse_control("name,x,y,px,py,image\nt1,,,10,20,a.jpg\n", "marks.csv").points
+    assert not target.is_surveyed
+    with pytest.raises(JaxbaError, match=r"line 2: a point without coordinates needs a name"):
+        parse_control("name,x,y,px,py,image\n,,,10,20,a.jpg\n", "marks.csv")
+    with pytest.raises(JaxbaError, match=r"line 2: y '' is no number"):
+        parse_control("name,x,y,px,py,image,crs\nt1,5,,10,20,a.jpg,EPSG:32615\n", "marks.csv")
+    with pytest.raises(JaxbaError, match=r"line 3: t1 has crs none, and EPSG:32615 in gcp_list.txt line 2; give one"):
+        parse_control("EPSG:32615\n1 2 3 12 22 a.jpg t1\nNaN NaN NaN 10 20 b.jpg t1\n")

@@ -8,12 +8,15 @@ import pytest
 
 import jaxba.io
 from jaxba.io import (
+    BAR_COLUMNS,
+    BAR_RESULT_COLUMNS,
     CLOUD_COLUMNS,
     CONTROL_COLUMNS,
     SITE_COLUMNS,
     _gcp,
     _geotags,
     _list_cells,
+    parse_bars,
     parse_control,
     parse_geotags,
     schema_markdown,
@@ -96,8 +99,20 @@ def test_check_list_is_read_as_described():
     assert (point.name, len(point.marks), point.z_m) == ("check01", 2, 198.9)
 
 
+def test_scale_bars_are_read_as_described():
+    (text,) = examples("Scale bars")
+    first, second = parse_bars(text)
+    assert (first.first, first.second, first.length_m, first.std_m) == ("gcp01", "gcp02", 28.819, 0.002)
+    assert (second.first, second.std_m) == ("target03", None)
+
+
 @pytest.mark.parametrize(
-    ("title", "columns"), [("Positions as CSV", _geotags._COLUMNS), ("Control points as CSV", _gcp._COLUMNS)]
+    ("title", "columns"),
+    [
+        ("Positions as CSV", _geotags._COLUMNS),
+        ("Control points as CSV", _gcp._COLUMNS),
+        ("Scale bars", BAR_COLUMNS),
+    ],
 )
 def test_titles_of_columns_are_those_that_the_reader_takes(title: str, columns: Mapping[str, Sequence[str]]):
     assert spellings(columns) in section(title)
@@ -129,5 +144,5 @@ def test_table_of_the_tile_is_the_schema():
 
 def test_columns_of_exported_tables_are_those_that_are_written():
     exported = section("What a run exports")
-    for columns in (CLOUD_COLUMNS, CONTROL_COLUMNS, SITE_COLUMNS):
+    for columns in (CLOUD_COLUMNS, CONTROL_COLUMNS, BAR_RESULT_COLUMNS, SITE_COLUMNS):
         assert "".join(f"| `{name}` | {meaning} |\n" for name, meaning in columns.items()) in exported

@@ -26,7 +26,8 @@ def unit(rng: np.random.Generator, rows: int) -> np.ndarray:
 
 def random_prior(name: str, parameters: int, rng: np.random.Generator):
     """A prior of any kind, by the annotations of its class alone, so that a new kind is tested by itself."""
-    sizes = {"images": IMAGES, "cameras": CAMERA_COUNT, "points": POINTS, "parameters": parameters, "offsets": OFFSETS}
+    sizes = {"images": IMAGES, "cameras": CAMERA_COUNT, "points": POINTS, "parameters": parameters}
+    sizes |= {"offsets": OFFSETS, "ends": 2}
     values = {}
     for spec in prior_specs(name):
         shape = tuple(n if isinstance(n, int) else sizes.get(n, 2) for n in spec.shape)

@@ -397,3 +397,54 @@ def test_marks_set_in_smaller_photos_are_refused_with_their_width(factor: float)
     np.testing.assert_allclose(made.control.mark_xy_px, stored)
     made = run(given, of=of, mark_orientation="stored")
     np.testing.assert_allclose(made.control.mark_xy_px, factor * stored)
+
+
+def with_bars(bars: str | None, gcp: str | None, *, check: str | None = None, of: Any = None, **params: Any) -> Outputs:
+    of = photos() if of is None else of
+    inputs = Inputs(
+        photos=of,
+        reference=reference(of),
+        gcp=None if gcp is None else ("gcp_list.txt", gcp),
+        check=None if check is None else ("check_list.txt", check),
+        bars=None if bars is None else ("bars.csv", bars),
+    )
+    return control.run(inputs, Params(**params))
+
+
+MARKED = "".join(f"\nNaN NaN NaN {400 + 50 * k} 600 {photo}.jpg t{k}" for k in range(2) for photo in "abc")
+
+
+def test_bars_end_at_points_of_the_lists_with_coordinates_or_without() -> None:
+    made = with_bars("gcp0 t1 31.5 0.01\nt0 t1 12.25", gcp_list() + MARKED, bar_std=0.02)
+    bars = made.bars
+    assert bars.names == ("gcp0-t1", "t0-t1") and bars.length_m.tolist() == [31.5, 12.25]
+    assert bars.std_m.tolist() == [0.01, 0.02] and not bars.is_check.any()
+    assert bars.ends.names == ("gcp0", "t0", "t1") and np.bincount(bars.ends.mark_point).tolist() == [4, 3, 3]
+    assert made.control.names == ("gcp0", "gcp1", "gcp2", "gcp3") and len(made.control.mark_point) == 16
+    assert made.notes[0] != "" and not [note for note in made.notes if "t0" in note]
+    told = control.lines(made, Told(photos=()))
+    assert told[0] == "4 control points, 0 check points, 2 scale bars; 16 marks in 4 photos"
+    assert [bar["first"] for bar in control.facts(made, Told(photos=()))["bars"]] == ["gcp0", "t0"]
+
+
+def test_bars_alone_need_neither_coordinates_nor_positions() -> None:
+    of = photos(with_positions=False)
+    made = with_bars("t0 t1 12.25", "EPSG:32615" + MARKED, of=of)
+    assert made.control.num_points == 0 and made.reference.frame is None and made.bars.num == 1
+
+
+def test_a_bar_at_a_check_point_is_a_check_and_marks_for_nothing_are_told() -> None:
+    check = "EPSG:32615\n" + "\n".join(f"{X + 30} {Y} 199 500 {500 + k} {p}.jpg check1" for k, p in enumerate("ab"))
+    made = with_bars("gcp0 check1 30.2\ngcp0 t0 9", gcp_list() + MARKED, check=check)
+    assert made.bars.is_check.tolist() == [True, False]
+    assert "t1: marked without coordinates, and no scale bar ends there: not used." in made.notes
+
+
+def test_bars_whose_ends_nothing_marks_are_refused() -> None:
+    with pytest.raises(JaxbaError, match=r"bars.csv line 1: no list marks a point t7; the points are gcp0"):
+        with_bars("gcp0 t7 12", gcp_list())
+    with pytest.raises(JaxbaError, match=r"bars.csv: no list marks the ends of scale bars in photos"):
+        with_bars("gcp0 gcp1 12", None)
+    once = "\nNaN NaN NaN 400 600 a.jpg t0"
+    found = with_bars("gcp0 t0 12", gcp_list() + once)
+    assert "t0, an end of a scale bar, is marked in 1 of the photos; two or more fix a point." in found.notes

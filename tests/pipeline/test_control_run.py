@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import Transformer
 from small_survey import Survey
 
 from jaxba._errors import JaxbaError
@@ -103,3 +104,30 @@ def test_verification_passes_with_control_in_the_adjustment_and_fitted_afterward
 def test_a_list_that_is_not_there_is_named(survey: Survey, tmp_path: Path) -> None:
     with pytest.raises(JaxbaError, match=r"none.txt: there is no such file; give a gcp_list.txt or CSV"):
         survey.run(gcp=tmp_path / "none.txt", until="control")
+
+
+def test_scale_bars_take_part_and_reach_the_summary_and_the_files(survey: Survey, tmp_path: Path) -> None:
+    truth = np.load(survey.photos.parent / "truth.npz")
+    to_earth = Transformer.from_crs("EPSG:32615", "EPSG:4978", always_xy=True)  # over a few metres heights are as good
+    targets = dict(zip(truth["target_name"].tolist(), truth["target_in_crs_m"], strict=True))
+    one, two, three = (np.array(to_earth.transform(*targets[f"gcp0{k}"])) for k in (1, 2, 3))
+    own = survey.copy(tmp_path)
+    lines = (survey.photos.parent / "gcp_list.txt").read_text().splitlines()
+    marks = [f"NaN NaN NaN {' '.join(line.split()[3:])}" for line in lines[1:]]
+    (tmp_path / "marks.txt").write_text("\n".join([lines[0], *marks]))
+    longer = np.linalg.norm(two - three) + 0.5
+    bars = [f"gcp01,gcp02,{np.linalg.norm(one - two):.4f},0.003", f"gcp02,gcp03,{longer:.4f},0.003"]
+    (tmp_path / "bars.csv").write_text("\n".join(["first,second,length_m,std_m", *bars]))
+    run = own.run(gcp=tmp_path / "marks.txt", bars=tmp_path / "bars.csv")
+    good, wrong = run.facts["bars"]
+    assert good["used"] and not good["set_aside"] and abs(good["residual_m"]) < 0.01
+    assert wrong["set_aside"] and wrong["residual_m"] == pytest.approx(-0.5, abs=0.05)
+    assert any(text.startswith("Scale bar gcp02-gcp03 contradicts") for text in run.facts["adjust"]["findings"])
+    assert "control" not in run.facts
+    with open(own.project / "export" / "bars.csv", encoding="utf-8", newline="") as file:
+        assert [row["used"] for row in csv.DictReader(file)] == ["yes", "no"]
+    problem = read_tile(own.project / "export" / "tile.npz")
+    assert problem.num_bar_ends == 2 and problem.num_points == run.done.adjust.block.num_points + 2
+    again = own.run(gcp=tmp_path / "marks.txt", bars=tmp_path / "bars.csv")
+    assert again.stages_run == ()
+    assert [check.text for check in verify(own.project, PIPELINE, Params()) if check.state != "ok"] == []

@@ -25,6 +25,31 @@ CASES = [
         "Sigmas were not computed.",
     ),
     (
+        Finding.of("scale bars without ends", names=["a-b", "c-d"]),
+        "Scale bars of which fewer than two adjusted photos show an end: a-b, c-d; mark the ends in more photos.",
+    ),
+    (
+        Finding.of(
+            "scale bar contradicts",
+            name="a-b",
+            length_m=12.5,
+            residual_m=-0.305,
+            over_sigma=20.04,
+            limit=3.29,
+            is_set_aside=True,
+        ),
+        "Scale bar a-b contradicts the block: there it is 0.305 m shorter than the 12.5 m that were measured, 20.0 "
+        "sigma (limit 3.29). It was set aside. Check the length, its unit and the marks.",
+    ),
+    (
+        Finding.of("scale bar contradicts others", name="a-b"),
+        "Scale bar a-b contradicts the other bars, and was set aside; check its length, its unit and the marks.",
+    ),
+    (
+        Finding.of("scale by bars", count=1),
+        "1 scale bar told the scale of a block that has no place on earth: it is in metres.",
+    ),
+    (
         Finding.of("not settled", medians_px=[1.0, 0.8, 0.55]),
         "The median error still changed after 3 rounds (1.00, 0.80, 0.55 px); set adjust.max_rounds higher, or "
         "look at the edges and images named here.",
@@ -412,7 +437,7 @@ def test_what_is_not_known_is_left_out_of_a_sentence(finding: Finding, words: st
 
 def test_what_was_done_is_told_apart_from_what_asks_for_something():
     kinds = {finding.kind for finding, _ in CASES if not is_to_act_on(finding)}
-    assert kinds == {"edges left out", "common offset"}
+    assert kinds == {"edges left out", "common offset", "scale by bars"}
 
 
 def test_more_than_ten_photos_are_counted():

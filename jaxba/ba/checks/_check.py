@@ -200,6 +200,7 @@ def prepare(problem: Problem) -> Prepared:
     if not dropped.any():
         return Prepared(problem, dropped, kept)
 
+    _require_bars(problem, loose)
     free_points[loose], free_poses[idle_images], free_intrinsics[idle_cameras] = False, False, False
     free_intrinsics[open_intrinsics] = False
     if not (free_points.any() or free_poses.any() or free_intrinsics.any() or problem.free_antenna.any()):
@@ -236,11 +237,21 @@ def _controlled(problem: Problem) -> Bool[np.ndarray, " points"]:
     mask = np.zeros(problem.num_points, bool)
     for prior in problem.priors:
         index = getattr(prior, "point_index", None)
-        if index is not None:
+        if index is not None and prior.name != "scale_bar":
             sigmas = [getattr(prior, f.name) for f in dataclasses.fields(prior) if f.name.startswith("std")]
             finite = np.isfinite(np.concatenate([np.asarray(s) for s in sigmas], axis=1)).all(axis=1)
             mask[np.asarray(index)[finite]] = True
     return mask
+
+
+def _require_bars(problem: Problem, loose: Bool[np.ndarray, " points"]) -> None:
+    bars = problem.prior("scale_bar")
+    point = np.zeros(0, int) if bars is None else np.asarray(vars(bars)["point_index"])
+    for row in np.flatnonzero(loose[point]):
+        raise JaxbaError(
+            f"prior scale_bar: point {point[row]}, an end of bar {row // 2}, is left with fewer than two observations "
+            "in front of the camera; leave the bar out, or correct the start values."
+        )
 
 
 def _without_effect(prior: AbstractPrior, held: dict[str, Bool[np.ndarray, " n"]]) -> AbstractPrior:

@@ -60,7 +60,7 @@ def free_gauge(problem: Problem) -> tuple[str, ...]:
     parts = Parts.of(problem)
     normal, of_antenna = _normal_matrices(problem, parts)
     columns = np.arange(7)
-    antenna = 7 + np.flatnonzero(problem.free_antenna)
+    antenna = 7 + np.flatnonzero(_free_antenna(problem))
     if len(antenna) and not _antenna_determined(normal, of_antenna, antenna):
         normal[:, 7:, 7:] += of_antenna
         columns = np.concatenate([columns, antenna])
@@ -116,7 +116,7 @@ def _normal_matrices(
 
     Every group of rows is divided by its trace, so that its sigmas' unit does not matter.
     """
-    free_antenna = problem.free_antenna
+    free_antenna = _free_antenna(problem)
     size = 7 + len(free_antenna)
     normal = np.zeros((len(parts.size), size, size))
     of_antenna = np.zeros((len(free_antenna),) * 2)
@@ -139,6 +139,8 @@ def _normal_matrices(
         image, point = getattr(prior, "image_index", None), getattr(prior, "point_index", None)
         part = parts.of_image[np.asarray(image)] if rows.pose is not None else parts.of_point[np.asarray(point)]
         inside = part >= 0
+        if prior.name == "scale_bar":  # between parts that share no points it holds neither
+            inside &= part == part.reshape(-1, 2)[:, ::-1].reshape(-1)
         part = part[inside]
         along = np.zeros((len(part), rows.residual.shape[0], size))
         if rows.pose is not None:
@@ -148,10 +150,35 @@ def _normal_matrices(
             jacobian = np.moveaxis(np.asarray(rows.point.jacobian), 2, 0)[inside]
             along[:, :, :7] += jacobian @ parts.move_points(part, np.asarray(problem.points)[np.asarray(point)[inside]])
         if rows.antenna is not None:
-            along[:, :, 7:] = np.moveaxis(np.asarray(rows.antenna), 2, 0)[inside] * parts.size[part][:, None, None]
-            along[:, :, 7:] *= free_antenna
+            by_antenna = np.moveaxis(np.asarray(rows.antenna), 2, 0)[inside]
+            along[:, :, 7:] = by_antenna * parts.size[part][:, None, None] * free_antenna
+            along[:, :, :7] += _along_ends(problem, parts, part, by_antenna)
         normal += _grams(along, part, len(parts.size), size)
     return normal, of_antenna
+
+
+def _free_antenna(problem: Problem) -> Bool[np.ndarray, " antenna"]:
+    """Return what is free of the antenna but for the ends of scale bars, which move with their points."""
+    free = np.array(problem.free_antenna)
+    free[len(free) - 3 * problem.num_bar_ends :] = False
+    return free
+
+
+def _along_ends(
+    problem: Problem,
+    parts: Parts,
+    part: Int[np.ndarray, " rows"],
+    by_antenna: Float[np.ndarray, "rows components antenna"],
+) -> Float[np.ndarray, "rows components 7"]:
+    """Return the derivatives by the seven directions that rows have through the ends of scale bars."""
+    ends = problem.num_bar_ends
+    if not ends:
+        return np.zeros((*by_antenna.shape[:2], 7))
+    rows, columns = len(part), by_antenna.shape[2] - 3 * ends
+    bars = vars(problem.prior("scale_bar"))
+    xyz = np.asarray(bars["xyz"], float) + np.asarray(problem.position_offset, float)[-ends:]
+    moved = parts.move_points(np.repeat(part, ends), np.tile(xyz, (rows, 1))).reshape(rows, 3 * ends, 7)
+    return by_antenna[:, :, columns:] @ moved
 
 
 def _fixed_point_grams(problem: Problem, parts: Parts) -> Float[np.ndarray, "parts 7 7"]:

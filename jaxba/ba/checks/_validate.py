@@ -33,6 +33,7 @@ def validate(problem: Problem) -> None:
         "cameras": _length(problem.lower),
         "parameters": len(parameters),
         "offsets": _length(problem.position_offset),
+        "ends": 2,
     }
     if problem.image_names and len(problem.image_names) != sizes["images"]:
         names, images = len(problem.image_names), sizes["images"]
@@ -243,6 +244,8 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
                 f"prior {prior.name}: {label(int(twice[0]))} has more than one row{_more(twice)}; keep one of them."
             )
         label = lambda row: of_kind(int(index[row]))  # noqa: E731
+    if prior.name == "scale_bar":
+        _check_bars(problem, values)
     if prior.name == "position_offset" and not indices:
         every = np.arange(sizes["rows"])
         _check_index(problem, f"prior {prior.name}: rows", every, "rows", "offsets", sizes)
@@ -261,6 +264,17 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
             _check_quaternion(name, value, label)
         else:
             _check_finite(f"{name} (any number where the sigma is infinite)", value, label)
+
+
+def _check_bars(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
+    ends, offsets = values["offset_index"], _length(problem.position_offset)
+    in_pairs = len(ends) % 2 == 0 and np.array_equal(values["end_index"], np.arange(len(ends)) % 2)
+    are_last = np.array_equal(ends, np.arange(offsets - len(ends), offsets))
+    if not (in_pairs and are_last and problem.free.position_offset):
+        raise JaxbaError(
+            "prior scale_bar: two rows, one after the other, are one bar, and the ends of all bars are the last rows "
+            "of position_offset, which is free; make them by with_scale_bars."
+        )
 
 
 def _dims(annotation: Any) -> str:

@@ -9,12 +9,15 @@ from jaxba.ba.groups._lever_arm import LeverArmPrior
 from jaxba.ba.groups._position import PositionPrior
 from jaxba.ba.groups._position_offset import PositionOffsetPrior
 from jaxba.ba.groups._reprojection import Reprojection
+from jaxba.ba.groups._scale_bar import ScaleBarPrior
 
-_IN_FILES = PositionPrior, AttitudePrior, IntrinsicsPrior, ControlPointPrior, LeverArmPrior, PositionOffsetPrior
+_IN_FILES = (
+    PositionPrior, AttitudePrior, IntrinsicsPrior, ControlPointPrior, LeverArmPrior, PositionOffsetPrior, ScaleBarPrior,
+)  # fmt: skip
 PRIORS: dict[str, type[AbstractPrior]] = {prior.name: prior for prior in _IN_FILES}
 """Every prior that a file can hold, by name; `tile.npz` and messages are driven by this table."""
 
 __all__ = [
     "PRIORS", "AspectPrior", "AttitudePrior", "ControlPointPrior", "IntrinsicsPrior", "LeverArmPrior",
-    "PositionOffsetPrior", "PositionPrior", "Reprojection",
+    "PositionOffsetPrior", "PositionPrior", "Reprojection", "ScaleBarPrior",
 ]  # fmt: skip

@@ -98,6 +98,11 @@ def partition(
     size = _Size.of_options(max_images, max_observations)
     require_number("partition: overlap", overlap, 0.0, 2.0**31 - 1, "give a whole number of images", whole=True)
     validate(problem)
+    if problem.num_bar_ends:
+        raise JaxbaError(
+            "partition: the block has scale bars, whose points may come to lie in different tiles; jaxba.solve_tiled "
+            "solves it whole, or leave the prior scale_bar out."
+        )
     if problem.num_images < 2:
         raise JaxbaError("partition: the block has one image; there is nothing to cut.")
     owner = _along_the_flight(problem, size) if by == "flight-line" else _by_space(problem, size)

@@ -123,7 +123,7 @@ def _counts(exported: Exported) -> Iterator[Check]:
         points[OPENSFM], images[OPENSFM] = len(exported[OPENSFM]["points"]), len(exported[OPENSFM]["shots"])
     if exported.has(TILE):
         images[TILE] = exported[TILE].num_images
-        points[TILE], observations[TILE] = _without_control(exported[TILE])
+        points[TILE], observations[TILE] = _without_marked(exported[TILE])
     for what, counts in (("points", points), ("images", images), ("observations", observations)):
         name = f"counts {what}"
         if len(counts) < 2:
@@ -134,12 +134,13 @@ def _counts(exported: Exported) -> Iterator[Check]:
         yield judged(name, len(set(counts.values())) == 1, same, f"the files disagree: {texts}; {_CURE}.")
 
 
-def _without_control(tile: "Problem") -> tuple[int, int]:
-    """Return the numbers of tie points and of their observations: a tile holds control points and their marks, too."""
-    from jaxba.ba import ControlPointPrior
+def _without_marked(tile: "Problem") -> tuple[int, int]:
+    """Return the numbers of tie points and of their observations: a tile holds what marks show, too."""
+    from jaxba.ba import ControlPointPrior, ScaleBarPrior
 
-    of_control = [np.asarray(prior.point_index) for prior in tile.priors if isinstance(prior, ControlPointPrior)]
-    index = np.concatenate([np.zeros(0, int), *of_control])
+    marked = ControlPointPrior, ScaleBarPrior
+    points = [np.asarray(vars(prior)["point_index"]) for prior in tile.priors if isinstance(prior, marked)]
+    index = np.unique(np.concatenate([np.zeros(0, int), *points]))
     marks = np.isin(np.asarray(tile.observations.point_index), index)
     return tile.num_points - len(index), tile.num_observations - int(marks.sum())
 

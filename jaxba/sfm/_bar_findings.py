@@ -1,0 +1,33 @@
+"""Findings on scale bars: those that contradict the block, those without ends, and what they tell of its scale."""
+
+import numpy as np
+
+from jaxba.scene import BarFit, Block, Finding, ScaleBars
+from jaxba.sfm._measured import OUTLIER
+
+
+def bar_findings(bars: ScaleBars, fit: BarFit, block: Block) -> tuple[Finding, ...]:
+    """Return the findings on the scale bars of an adjusted block."""
+    found = []
+    lost = np.flatnonzero(~np.isfinite(fit.distance_m))
+    if len(lost):
+        found.append(Finding.of("scale bars without ends", names=[bars.names[k] for k in lost]))
+    with np.errstate(invalid="ignore"):
+        is_off = fit.is_set_aside | (~fit.is_used & (np.abs(fit.over_sigma) > OUTLIER))
+    if block.is_georeferenced:
+        found += [
+            Finding.of(
+                "scale bar contradicts",
+                name=bars.names[k],
+                length_m=float(bars.length_m[k]),
+                residual_m=float(fit.residual_m[k]),
+                over_sigma=float(abs(fit.over_sigma[k])),
+                limit=OUTLIER,
+                is_set_aside=bool(fit.is_set_aside[k]),
+            )
+            for k in np.flatnonzero(is_off)
+        ]
+    elif fit.is_used.any():
+        found += [Finding.of("scale bar contradicts others", name=bars.names[k]) for k in np.flatnonzero(is_off)]
+        found.append(Finding.of("scale by bars", count=int(fit.is_used.sum())))
+    return tuple(found)

@@ -30,6 +30,7 @@ from jaxba.ba.tiles._right_hand_sides import solved
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
 Datum = Literal["priors", "inner"]
+Independent = Literal["observations", "tracks"]
 _PROBING = 1e-9  # damping, relative, under which a singular system shows where it is weak
 _MAX_INFLATION = 1e13  # of a variance by the other unknowns: beyond it rounding has eaten the answer
 
@@ -76,6 +77,7 @@ def covariance(
     *,
     loss: AbstractLoss | None = None,
     datum: Datum = "priors",
+    independent: Independent = "observations",
     max_memory: float | str | None = None,
     max_observations: float = TILE_OBSERVATIONS,
     folder: str | os.PathLike[str] | None = None,
@@ -86,6 +88,8 @@ def covariance(
     - `loss`: as given to `solve`; rows count with the weight that it gives them (least squares if None).
     - `datum`: what the block's place, rotation and scale are known from: `priors`, with what is held fixed, or `inner`
       for photos alone, under inner constraints over the points, whatever priors say.
+    - `independent`: of which errors are: `observations`, or only `tracks`, some of which are measured worse than others
+      in all their images. That tells in `border` and in intrinsics that images share (`_track_scores.py`).
     - `max_memory`, `max_observations`, `folder`, `workers`: as in `solve_tiled`.
 
     Raises `JaxbaError` where the problem has no gauge, where something in it is not determined, and where memory or
@@ -103,7 +107,11 @@ def covariance(
         "folder": folder,
         "workers": workers,
     }
-    return marginals_at("Covariance", problem, Linear() if loss is None else loss, datum, "none", **room).covariance
+    if independent not in get_args(Independent):
+        choices = " or ".join(map(repr, get_args(Independent)))
+        raise JaxbaError(f"covariance: independent {independent!r}; give {choices}.")
+    rows: Rows = "none" if independent == "observations" else "tracks"
+    return marginals_at("Covariance", problem, Linear() if loss is None else loss, datum, rows, **room).covariance
 
 
 class At(NamedTuple):
@@ -193,7 +201,8 @@ def _in_order(
     free_intrinsics = np.asarray(free.intrinsics)
     shared_free = np.zeros(0, bool) if shape.own_cameras else free_intrinsics[:, refined].reshape(-1)
     border_free = np.append(shared_free, problem.free_antenna[: shape.antenna])
-    border = found.border * np.outer(border_free, border_free)
+    of_border = found.border if found.tracks is None else found.border + found.tracks.by_tracks()
+    border = of_border * np.outer(border_free, border_free)
     offsets, num_antenna = len(problem.position_offset) - problem.num_bar_ends, 0
     if shape.antenna:
         num_antenna = 3 + 3 * offsets

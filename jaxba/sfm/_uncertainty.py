@@ -13,7 +13,8 @@ that of a track with the sum S and d = 2n - 3 is then expected to be
 
     (nu s^2 + S) / (nu + d - 2).
 
-So a point of two images hardly speaks for itself, one of ten does.
+So a point of two images hardly speaks for itself, one of ten does. Intrinsics, which all tracks tell, have the sigmas
+of a block in which only tracks are independent of each other.
 """
 
 import dataclasses
@@ -61,7 +62,7 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     problem = weighed(adjusted.problem, times, block.num_observations)
     loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
-        found = covariance(problem, loss=loss, max_memory=adjusted.max_memory)
+        found = covariance(problem, loss=loss, independent="tracks", max_memory=adjusted.max_memory)
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")

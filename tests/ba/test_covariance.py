@@ -294,3 +294,54 @@ def test_unknown_without_measurements_is_named():
     )
     with pytest.raises(JaxbaError, match=r"do not determine the pose of image 4 \(4.jpg\)"):
         covariance(loose)
+
+
+@pytest.mark.parametrize(
+    ("case", "num_tiles"),
+    [
+        ("shared camera, every prior", 1),
+        ("shared camera, every prior", 2),
+        ("three cameras, fixed blocks, robust", 1),
+        ("own cameras, some fixed", 1),
+    ],
+)
+def test_covariances_by_tracks_are_those_of_dense_scores(case: str, num_tiles: int):
+    """The reference sums each track's gradient with all unknowns of a dense system, its point among them."""
+    problem, loss, plain = case_and_dense(case)
+    rng = np.random.default_rng(0)
+    seen = problem.observations
+    worse = np.exp(rng.normal(size=problem.num_points))[np.asarray(seen.point_index)][:, None]
+    noise = worse * np.asarray(seen.std_px)[:, None] * rng.normal(size=seen.xy_px.shape)
+    problem = eqx.tree_at(lambda p: p.observations.xy_px, problem, np.asarray(seen.xy_px) + noise)
+    room = problem.num_observations / num_tiles
+    found = covariance(problem, loss=loss, independent="tracks", max_observations=room)
+    dense = Dense(problem, loss)
+    groups, weights = dense.groups(), []
+    normal = np.zeros((dense.size, dense.size))
+    for group in groups:
+        weight = loss_derivatives(group.loss, np.sum(group.residual**2, axis=1))[1]
+        weights.append(weight)
+        normal += np.einsum("r,rcm,rcn->mn", weight, group.jacobian, group.jacobian, optimize=True)
+    unit = 1 / np.sqrt(np.diagonal(normal))
+    inverse = np.linalg.inv(normal * np.outer(unit, unit)) * np.outer(unit, unit)
+    pixels, point = groups[0], np.asarray(problem.observations.point_index)
+    scores = np.zeros((problem.num_points, dense.size))
+    np.add.at(scores, point, np.einsum("r,rcm,rc->rm", weights[0], pixels.jacobian, pixels.residual))
+    alike = np.einsum("r,rcm,rcn->mn", weights[0], pixels.jacobian, pixels.jacobian, optimize=True)
+    of_points = 2 * np.bincount(point, minlength=problem.num_points) - 3 * np.asarray(problem.free.points)
+    freedom = np.maximum(of_points, 0).sum()
+    factor = np.sum(weights[0] * np.sum(pixels.residual**2, axis=1)) / freedom
+    whole = inverse + inverse @ (scores.T @ scores / factor - alike) @ inverse
+    place = plain.step.intrinsics.astype(int)
+    matrix = np.zeros_like(plain.matrix)
+    free = dense.flat(plain.step).astype(int)
+    matrix[np.ix_(free, free)] = whole
+    of_tracks = matrix[place[..., :, None], place[..., None, :]]
+    if case.startswith("own"):  # each is its image's, and no unknown that tracks of other images tell
+        assert_same(found.intrinsics, covariance(problem, loss=loss).intrinsics)
+    else:
+        assert_same(found.intrinsics, of_tracks)
+        as_alike = covariance(problem, loss=loss).intrinsics[:, 0, 0]
+        assert np.max(np.abs(found.intrinsics[:, 0, 0] / as_alike - 1)) > 0.02
+    arm = plain.step.antenna[:3].astype(int)
+    assert_same(found.lever_arm, matrix[np.ix_(arm, arm)])

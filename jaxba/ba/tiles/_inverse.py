@@ -20,12 +20,13 @@ from jaxba.ba._plan_shape import num_rows
 from jaxba.ba._point_marginals import InverseBlocks, Joint, Squares, joint_marginals, point_marginals, squares
 from jaxba.ba._problem import Problem
 from jaxba.ba._system import System
+from jaxba.ba._track_scores import TrackSums, track_sums
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Call, Engine
 
-Rows = Literal["none", "priors", "all"]
-"""Whose leverages are asked for: of all rows those of the reprojections come first."""
+Rows = Literal["none", "priors", "all", "tracks"]
+"""Whose leverages are asked for: of all rows those of the reprojections come first; or the sums over tracks alone."""
 
 
 class Marginals(NamedTuple):
@@ -34,7 +35,7 @@ class Marginals(NamedTuple):
     - `blocks`: of images. `border`: joint, of the shared unknowns.
     - `block_inflation`, `border_inflation`: each variance over what it were if all other unknowns were known.
     - `squares`: of the reprojections and the priors, by tiles.
-    - `leverages`: of the rows that were asked for, in the problem's order.
+    - `leverages`: of the rows that were asked for, in the problem's order. `tracks`: the sums, where these were.
     """
 
     blocks: Float[np.ndarray, "images block block"]
@@ -44,6 +45,7 @@ class Marginals(NamedTuple):
     border_inflation: Float[np.ndarray, " border"]
     squares: tuple[Squares, ...]
     leverages: tuple[Leverage, ...] = ()
+    tracks: TrackSums | None = None
 
 
 class _OfTile(NamedTuple):
@@ -53,6 +55,7 @@ class _OfTile(NamedTuple):
     points: Float[np.ndarray, "points 3 3"]
     squares: tuple[Squares, ...]
     leverages: tuple[Leverage, ...]
+    tracks: TrackSums | None
 
 
 def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none") -> None:
@@ -69,9 +72,11 @@ def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none") -
         )
         of_points = system, model, inverse, np.zeros(())
         joint = jax.eval_shape(joint_marginals, *of_points)
-        of_all = joint_marginals if rows == "all" else point_marginals
+        of_all = joint_marginals if rows in ("all", "tracks") else point_marginals
         found = [Call(of_all, of_points), Call(squares, (system, part))]
-        if rows != "none":
+        if rows == "tracks":
+            found.append(Call(track_sums, (system, part, inverse, joint)))
+        elif rows != "none":
             found.append(Call(prior_leverages, (system, part, inverse, joint.points)))
         if rows == "all":
             found.append(Call(pixel_leverage, (system, part, inverse, joint)))
@@ -116,13 +121,14 @@ def marginals(
 
     points = np.zeros((len(tree.tile_of_point), 3, 3))
     parts: list[tuple[Squares, ...]] = [()] * len(engine.tiles)
+    sums: list[TrackSums | None] = [None] * len(engine.tiles)
     of_rows = _empty(problem, rows)
     for found in engine.each_tile(of_tile, descend()):
         tile, _ = engine.tiles[found.number]
         own = tree.node_of_image[tile.order] <= tree.tiles[found.number]
         blocks[tile.order[own]] = found.blocks[own]
         points[tile.points[tile.plan.point_order]] = found.points
-        parts[found.number] = found.squares
+        parts[found.number], sums[found.number] = found.squares, found.tracks
         places = (tile.rows, *tile.prior_rows) if rows == "all" else tile.prior_rows
         for whole, part, place in zip(of_rows, found.leverages, places, strict=bool(of_rows)):
             for all_rows, own_rows in zip(whole, part, strict=True):
@@ -136,12 +142,13 @@ def marginals(
         np.diagonal(corner) * up.border_diagonal,
         tuple(groups),
         of_rows,
+        TrackSums(*map(sum, zip(*sums, strict=True))) if rows == "tracks" else None,  # type: ignore[arg-type]
     )
 
 
 def _empty(problem: Problem, rows: Rows) -> tuple[Leverage, ...]:
     """Return arrays for the leverages of all rows."""
-    if rows == "none":
+    if rows in ("none", "tracks"):
         return ()
     own = Unknowns(problem.poses, np.zeros(problem.free.intrinsics.shape), problem.antenna, problem.points)
     shapes = [(num_rows(prior), jax.eval_shape(prior.residual, own).shape[0]) for prior in problem.priors]
@@ -184,6 +191,7 @@ def _of_tile(
     found = jax.tree.map(np.asarray, call_compiled(squares, system, own))
     of_points = system, model, inverse, np.array(damping)
     groups: list[Leverage] = []
+    tracks: TrackSums | None = None
     takes: list[np.ndarray] = []
     if rows == "all":
         joint: Joint = call_compiled(joint_marginals, *of_points)
@@ -191,14 +199,18 @@ def _of_tile(
         groups.append(call_compiled(pixel_leverage, system, own, inverse, joint))
         seen = np.flatnonzero(tile.plan.row_observation >= 0)
         takes.append(seen[np.argsort(tile.plan.row_observation[seen])])
+    elif rows == "tracks":
+        joint = call_compiled(joint_marginals, *of_points)
+        points = joint.points
+        tracks = jax.tree.map(np.asarray, call_compiled(track_sums, system, own, inverse, joint))
     else:
         points = call_compiled(point_marginals, *of_points)
-    if rows != "none":
+    if rows in ("priors", "all"):
         groups += call_compiled(prior_leverages, system, own, inverse, points)
         takes += [np.arange(len(places)) for places in tile.prior_rows]  # what follows is padding
     of_rows = tuple(Leverage(*(np.asarray(part)[take] for part in of)) for of, take in zip(groups, takes, strict=True))
     count = len(tile.order)
-    return _OfTile(number, images[:count], np.asarray(points)[: len(tile.points)], found, of_rows)
+    return _OfTile(number, images[:count], np.asarray(points)[: len(tile.points)], found, of_rows, tracks)
 
 
 def inverse_of_border(corner: Float[np.ndarray, "border border"]) -> Float[np.ndarray, "border border"]:

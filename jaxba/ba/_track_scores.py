@@ -1,0 +1,88 @@
+"""What single tracks do to the shared unknowns: the compiled part of covariances by tracks.
+
+A blurred or slanted feature is measured worse in all its images, so that its errors are not those of others. With only
+tracks taken for independent (Liang and Zeger 1986) the part of the observations in the covariance of the shared
+unknowns, A = sum over observations of k k^T, becomes
+
+    M = sum over tracks of u u^T / f,    u = sum over the track's observations of k r,    k = C J^T
+
+with J and r as the loss weighs them, C the covariances of the shared unknowns with what an observation depends on, and
+f = sum r^2 / sum (2 n - 3) over tracks of n views: M is A where all errors are alike, however large. As C N = 1, the
+scores u of a track hold nothing of its own point, whose freedom its residuals lack.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxba.ba._linearise import masked_columns, scan_chunks
+from jaxba.ba._point_marginals import InverseBlocks, Joint
+from jaxba.ba._reweighting import reweighting
+from jaxba.ba._rows import rows_of, segments
+from jaxba.ba._system import System
+from jaxba.ba._unknowns import Unknowns
+from jaxba.ba.groups import Reprojection
+
+
+class TrackSums(NamedTuple):
+    """Sums over the tracks of a tile, or of all.
+
+    - `scores`: of u u^T. `alike`: A. `squared`: of r^2. `freedom`: of 2 n - 3.
+    """
+
+    scores: Float[Array | np.ndarray, "border border"]
+    alike: Float[Array | np.ndarray, "border border"]
+    squared: Float[Array | np.ndarray, ""]
+    freedom: Float[Array | np.ndarray, ""]
+
+    def by_tracks(self) -> Float[np.ndarray, "border border"]:
+        """Return what is to be added to the covariance of the shared unknowns."""
+        if not (self.freedom > 0 and self.squared > 0):
+            return np.zeros(self.alike.shape)
+        return np.asarray(self.scores) * float(self.freedom / self.squared) - np.asarray(self.alike)
+
+
+def track_sums(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint: Joint) -> TrackSums:
+    """Return the sums over the tracks of a system; `inverse`, `joint`: of its equations at the same unknowns."""
+    shape = system.shape
+    columns, k = 6 + shape.num_refined, shape.num_refined
+    place = None
+    if not shape.own_cameras and k:
+        place = jnp.asarray(system.reprojection.camera_index)[:, None] * k + jnp.arange(k)
+    corner, of_images = jnp.asarray(inverse.corner), jnp.asarray(inverse.border)
+
+    def body(carry: tuple[Array, ...], part: Reprojection) -> tuple[tuple[Array, ...], tuple[()]]:
+        scores, views, alike, squared = carry
+        rows = part.rows(unknowns, lambda residual: reweighting(residual, system.loss, jnp.zeros(())))
+        rows = masked_columns(rows, part, system)
+        residual, by_point = rows[:, :, columns], rows[:, :, columns + 1 :]
+        by_image = rows[:, :, : shape.block]
+        pull = jnp.einsum("rcal,rab->rlcb", by_image, rows_of(of_images, part.run_image))
+        if place is not None:
+            on_border = rows_of(corner, rows_of(place, part.run_image))
+            pull += jnp.einsum("rckl,rkb->rlcb", rows[:, :, 6:columns], on_border)
+        pull += jnp.einsum("rcil,rlib->rlcb", by_point, rows_of(joint.with_border, part.point_index))
+        index = part.point_index.reshape(-1)
+        of_rows = jnp.einsum("rlcb,rcl->rlb", pull, residual).reshape(len(index), -1)
+        seen = (jnp.asarray(part.weight) > 0).reshape(-1).astype(views.dtype)
+        flat = pull.reshape(-1, pull.shape[-1])
+        return (
+            scores + segments(of_rows, index, shape.num_points),
+            views + segments(seen, index, shape.num_points),
+            alike + flat.T @ flat,
+            squared + jnp.sum(residual**2),
+        ), ()
+
+    dtype = unknowns.points.dtype
+    start = (
+        jnp.zeros((shape.num_points, shape.border), dtype),
+        jnp.zeros(shape.num_points, dtype),
+        jnp.zeros((shape.border, shape.border), dtype),
+        jnp.zeros((), dtype),
+    )
+    (scores, views, alike, squared), _ = scan_chunks(system, body, start)
+    freedom = jnp.sum(jnp.maximum(2 * views - 3 * jnp.asarray(system.free.points)[:, 0], 0.0))
+    return TrackSums(scores.T @ scores, alike, squared, freedom)

@@ -7,8 +7,8 @@ unknowns, A = sum over observations of k k^T, becomes
     M = sum over tracks of u u^T / f,    u = sum over the track's observations of k r,    k = C J^T
 
 with J and r as the loss weighs them, C the covariances of the shared unknowns with what an observation depends on, and
-f = sum r^2 / sum (2 n - 3) over tracks of n views: M is A where all errors are alike, however large. As C N = 1, the
-scores u of a track hold nothing of its own point, whose freedom its residuals lack.
+f = sum r^2 / sum (2 n - 3) over tracks of n views (2 n of a fixed point): M is A where all errors are alike, however
+large. As C N = 1, the scores u of a track hold nothing of its own point, whose freedom its residuals lack.
 """
 
 from typing import NamedTuple

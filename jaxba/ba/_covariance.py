@@ -107,11 +107,8 @@ def covariance(
         "folder": folder,
         "workers": workers,
     }
-    if independent not in get_args(Independent):
-        choices = " or ".join(map(repr, get_args(Independent)))
-        raise JaxbaError(f"covariance: independent {independent!r}; give {choices}.")
-    rows: Rows = "none" if independent == "observations" else "tracks"
-    return marginals_at("Covariance", problem, Linear() if loss is None else loss, datum, rows, **room).covariance
+    loss = Linear() if loss is None else loss
+    return marginals_at("Covariance", problem, loss, datum, independent, "none", **room).covariance
 
 
 class At(NamedTuple):
@@ -127,29 +124,39 @@ class At(NamedTuple):
     kept: Int[np.ndarray, " kept"]
 
 
-def marginals_at(label: str, problem: Problem, loss: AbstractLoss, datum: Datum, rows: Rows, **room: Any) -> At:
+def marginals_at(
+    label: str,
+    problem: Problem,
+    loss: AbstractLoss,
+    datum: Datum,
+    independent: Independent,
+    rows: Rows,
+    **room: Any,
+) -> At:
     """Return the covariances, and the leverages of the rows that are asked for.
 
-    - `label`: of the function that asks, for messages. `datum`, `room`: as in `covariance`, whose errors it raises.
+    - `label`: of the function that asks, for messages. `datum`, `independent`, `room`: as in `covariance`, whose errors
+      it raises.
     """
     check_loss(f"{label.lower()}: loss", loss)
-    if datum not in get_args(Datum):
-        raise JaxbaError(f"{label.lower()}: datum {datum!r}; give {' or '.join(map(repr, get_args(Datum)))}.")
+    for name, given, choices in (("datum", datum, Datum), ("independent", independent, Independent)):
+        if given not in get_args(choices):
+            raise JaxbaError(f"{label.lower()}: {name} {given!r}; give {' or '.join(map(repr, get_args(choices)))}.")
     if datum == "inner":
         problem = of_photos_alone(label, problem)
     prepared = prepare(problem)
     of_datum = _of_priors if datum == "priors" else _of_photos
-    found = of_datum(label, prepared.problem, loss, rows, **room)
+    found = of_datum(label, prepared.problem, loss, rows, independent == "tracks", **room)
     losses = [loss, *(prior.loss for prior in problem.priors)]
     defect = 0 if datum == "priors" else 7
     of_all = _in_order(found, losses, prepared.problem, prepared.dropped, defect)
     return At(problem, of_all, found.leverages, prepared.kept)
 
 
-def _of_photos(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, **room: Any) -> Marginals:
+def _of_photos(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, by_tracks: bool, **room: Any) -> Marginals:
     """Return the marginals under inner constraints; the reach of rows, which those would tell, is not known."""
     block = free_block(label, problem)
-    found = _of_priors(label, block.held, loss, rows, **room)
+    found = _of_priors(label, block.held, loss, rows, by_tracks, **room)
     unknowns = own_unknowns(block.held)
     with opened(label.lower(), block.held, loss, **room) as engine:
         across = solved(engine, unknowns, block.columns())
@@ -159,13 +166,13 @@ def _of_photos(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, **r
     return found._replace(blocks=blocks, points=points, squares=found.squares[:-1], leverages=leverages)
 
 
-def _of_priors(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, **room: Any) -> Marginals:
+def _of_priors(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, by_tracks: bool, **room: Any) -> Marginals:
     """Return the marginals as priors, and what is fixed, hold a problem that was checked."""
     require_gauge(problem, label)
     unknowns = own_unknowns(problem)
     with opened(label.lower(), problem, loss, inverse=True, **room) as engine:
-        compile_marginals(engine, unknowns, rows)
-        found = _marginals(engine, problem, unknowns, 0.0, rows)
+        compile_marginals(engine, unknowns, rows, by_tracks=by_tracks)
+        found = _marginals(engine, problem, unknowns, 0.0, rows, by_tracks)
         if found is None or not _determined(found):
             weakest = _weakest(_marginals(engine, problem, unknowns, _PROBING), problem)
             raise JaxbaError(
@@ -176,11 +183,16 @@ def _of_priors(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, **r
 
 
 def _marginals(
-    engine: Engine, problem: Problem, unknowns: Unknowns, damping: float, rows: Rows = "none"
+    engine: Engine,
+    problem: Problem,
+    unknowns: Unknowns,
+    damping: float,
+    rows: Rows = "none",
+    by_tracks: bool = False,
 ) -> Marginals | None:
     """Return the marginals, or None where there are none."""
     try:
-        return marginals(engine, problem, unknowns, damping, rows)
+        return marginals(engine, problem, unknowns, damping, rows, by_tracks=by_tracks)
     except NotPositive:
         return None
 

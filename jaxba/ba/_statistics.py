@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from scipy.special import chdtrc
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._covariance import Covariance, Datum, marginals_at
+from jaxba.ba._covariance import Covariance, Datum, Independent, marginals_at
 from jaxba.ba._leverage import Leverage
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._reliability import RowStatistics, row_statistics
@@ -150,6 +150,7 @@ def statistics(
     *,
     loss: AbstractLoss | None = None,
     datum: Datum = "priors",
+    independent: Independent = "observations",
     max_memory: float | str | None = None,
     max_observations: float = TILE_OBSERVATIONS,
     folder: str | os.PathLike[str] | None = None,
@@ -174,7 +175,7 @@ def statistics(
         "folder": folder,
         "workers": workers,
     }
-    problem, found, leverages, kept = marginals_at("Statistics", problem, loss, datum, "all", **room)
+    problem, found, leverages, kept = marginals_at("Statistics", problem, loss, datum, independent, "all", **room)
     of_observations = leverages[0]
     std_px = np.repeat(np.asarray(problem.observations.std_px, float)[:, None], 2, axis=1)
     everywhere = Leverage(*(_at(np.asarray(part), kept, problem.num_observations) for part in of_observations))
@@ -193,7 +194,7 @@ def prior_statistics(
     Arguments and errors are those of `covariance`.
     """
     loss = Linear() if loss is None else loss
-    of_all = marginals_at("Statistics", problem, loss, "priors", "priors", max_memory=max_memory)
+    of_all = marginals_at("Statistics", problem, loss, "priors", "observations", "priors", max_memory=max_memory)
     return of_all.covariance, _of_priors(problem, of_all.leverages)
 
 

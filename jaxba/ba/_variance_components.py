@@ -61,15 +61,15 @@ class VarianceComponent:
 def variance_components(
     problem: Problem, loss: AbstractLoss, observations: RowStatistics, priors: Sequence[RowStatistics]
 ) -> tuple[VarianceComponent, ...]:
-    """Return the components of the kinds that have measurements: pixels of tie points and of control points, priors."""
-    control = problem.prior("control")
+    """Return the components of the kinds that have measurements: pixels of tie points and of marked points, priors."""
     seen = np.asarray(problem.observations.point_index)
-    surveyed = np.zeros(problem.num_points, bool)
-    if control is not None:
-        surveyed[np.asarray(control.point_index)] = True  # type: ignore[attr-defined]
+    marked = np.zeros(problem.num_points, bool)
+    for prior in problem.priors:
+        if hasattr(prior, "point_index"):
+            marked[np.asarray(vars(prior)["point_index"])] = True
     kinds: list[tuple[str, AbstractLoss, RowStatistics, np.ndarray, list[bool]]] = [
-        ("tie points", loss, observations, ~surveyed[seen], [True, True]),
-        ("marks", loss, observations, surveyed[seen], [True, True]),
+        ("tie points", loss, observations, ~marked[seen], [True, True]),
+        ("marks", loss, observations, marked[seen], [True, True]),
     ]
     for prior, rows in zip(problem.priors, priors, strict=True):
         every = np.ones(len(rows.weight), bool)

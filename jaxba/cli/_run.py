@@ -17,7 +17,7 @@ from jaxba.cli._text import first_of, labelled, many, to_json, wrapped
 from jaxba.engine import changed
 from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.pipeline import Event, Run, run_pipeline
-from jaxba.report import accuracy_row, bar_rows, control_rows, flight_lines
+from jaxba.report import accuracy_row, bar_rows, control_rows, flight_lines, statistics_rows
 
 _SUMMARY_LABEL = 12
 
@@ -146,4 +146,5 @@ def _result_rows(adjust: dict[str, Any], control: list[tuple[str, str]]) -> list
         figures = ", ".join(f"{rms:.2f}" for rms in used.values())
         rows.append(("GNSS fit", f"RMS {figures} m {', '.join(used)} over {adjust['num_gnss']} positions"))
     flights = flight_lines(adjust.get("flights", []))
+    rows += statistics_rows(adjust.get("statistics"))
     return [*rows, *labelled("flights", flights), *control, *labelled("findings", adjust["findings"])]

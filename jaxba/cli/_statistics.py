@@ -127,6 +127,9 @@ def _label(found: Statistics, rows: RowStatistics, row: int) -> str:
     prior = problem.prior(rows.name)
     if hasattr(prior, "image_index"):
         return f"{rows.name} of {problem.image_label(int(prior.image_index[row]))}"  # type: ignore[union-attr]
+    if rows.name == "scale_bar":
+        one, other = np.asarray(prior.point_index)[2 * row : 2 * row + 2]  # type: ignore[union-attr]
+        return f"scale bar of points {one} and {other}"
     if hasattr(prior, "point_index"):
         return f"{rows.name} of point {prior.point_index[row]}"  # type: ignore[union-attr]
     return f"{rows.name} {row}"

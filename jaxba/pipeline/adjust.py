@@ -11,7 +11,16 @@ from jaxtyping import Bool, Float
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._room import Room
 from jaxba.engine._words import many
-from jaxba.report import Told, bar_facts, control_facts, flight_facts, flight_lines, grouped, sentences
+from jaxba.report import (
+    Told,
+    bar_facts,
+    control_facts,
+    flight_facts,
+    flight_lines,
+    grouped,
+    sentences,
+    statistics_facts,
+)
 from jaxba.scene import (
     BarFit,
     Block,
@@ -25,6 +34,7 @@ from jaxba.scene import (
     PrunedEdge,
     Reference,
     ScaleBars,
+    SurveyStatistics,
     Tracks,
     ViewGraph,
     described,
@@ -94,6 +104,7 @@ class Outputs:
     - `flights`: what positions of each flight are off in common; None where flights are not told apart.
     - `control`: how the surveyed points fit. `mark_used`: of all marks, those that agree with the others.
     - `mark_std_px`: sigma of a mark that weighed them. `bars`: how the scale bars fit.
+    - `statistics`: of measurements and shared unknowns; None where sigmas were not computed.
     - `affine`: 3 x 4, what coordinates take beside the block, of `control.method=affine`; else the identity.
     - `findings`: what a surveyor should know, in figures: ambiguities, contradictions, bounds reached.
     """
@@ -126,6 +137,7 @@ class Outputs:
     spread: float = 1.0
     loss: str = "linear"
     loss_f_scale: float = 1.0
+    statistics: SurveyStatistics | None = None
     affine: Float[np.ndarray, "3 4"] = field(default_factory=lambda: np.eye(3, 4))
 
     @property
@@ -165,6 +177,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         inputs.bars,
     )
     sigmas = sfm.uncertainty(adjusted, reference)
+    judged = sigmas.statistics
     flights = sfm.flight_offsets(adjusted, sigmas, reference)
     control = dataclasses.replace(inputs.control, mark_std_px=adjusted.mark_std_px)
     controlled = sfm.apply_control(adjusted, sigmas, control, reference)
@@ -222,6 +235,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         spread=adjusted.spread,
         loss=params.loss,
         loss_f_scale=float(adjusted.loss.f_scale) / adjusted.spread,
+        statistics=None if judged is None else sfm.survey_statistics(adjusted, judged, inputs.reference),
         affine=controlled.affine,
     )
 
@@ -260,6 +274,7 @@ def facts(outputs: Outputs, told: Told) -> dict[str, Any]:
         "cameras": {
             name: {"parameters": list(map(float, row)), "std": list(map(float, std))} for name, row, std in cameras
         },
+        "statistics": statistics_facts(outputs.statistics),
         "usable": outputs.is_usable,
         "findings": sentences(outputs.findings),
         "edges_left_out": [dataclasses.asdict(edge) for edge in outputs.pruned],

@@ -12,6 +12,7 @@ from ._reference import (
     flight_lines as flight_lines,
     reference_facts as reference_facts,
 )
+from ._statistics import statistics_facts as statistics_facts, statistics_rows as statistics_rows
 from ._status import Status as Status, project_settings as project_settings, status as status
 from ._summary import summary as summary, told_of as told_of
 from ._tiles_picture import draw_tiles as draw_tiles

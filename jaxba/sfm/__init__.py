@@ -15,12 +15,13 @@ from jaxba.sfm._points import with_points
 from jaxba.sfm._problem import positions_hold, to_problem
 from jaxba.sfm._rounds import Settings, Tiling
 from jaxba.sfm._spread import weighed
+from jaxba.sfm._survey_statistics import survey_statistics
 from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [
     "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Tiling", "Uncertainty", "add_bars", "adjust",
     "agreeing_marks", "apply_affine", "apply_control", "bar_findings", "control_findings", "control_part", "findings",
     "flight_offsets", "free_parameters", "gnss_fit", "height_above_ground", "initialise", "intrinsics_at_bounds",
-    "place_by_control", "positions_hold", "to_problem", "transformed", "uncertainty", "weighed", "with_points",
-    "without_offsets",
+    "place_by_control", "positions_hold", "survey_statistics", "to_problem", "transformed", "uncertainty", "weighed",
+    "with_points", "without_offsets",
 ]  # fmt: skip

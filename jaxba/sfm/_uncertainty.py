@@ -24,7 +24,7 @@ from jaxtyping import Float
 from scipy.special import digamma, polygamma
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import Covariance, covariance
+from jaxba.ba import Covariance, Statistics, statistics
 from jaxba.scene import Block, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._cores import on_all_cores
@@ -44,6 +44,7 @@ class Uncertainty:
 
     - `position_std_m`, `point_std_m`: world. `intrinsics_std`: in the parameters' units, 0 for what is fixed.
     - `variance_factor`: of the residuals, by the sigmas that weighed observations, tails aside; NaN likewise.
+    - `statistics`: of the problem with the sigmas that its errors show.
     """
 
     position_std_m: Float[np.ndarray, "images 3"]
@@ -51,7 +52,11 @@ class Uncertainty:
     intrinsics_std: Float[np.ndarray, "cameras parameters"]
     variance_factor: float
     why_not: str | None = None
-    covariance: Covariance | None = None
+    statistics: Statistics | None = None
+
+    @property
+    def covariance(self) -> Covariance | None:
+        return None if self.statistics is None else self.statistics.covariance
 
 
 def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
@@ -62,11 +67,11 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
     problem = weighed(adjusted.problem, times, block.num_observations)
     loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
-        found = covariance(problem, loss=loss, independent="tracks", max_memory=adjusted.max_memory)
+        of_all = statistics(problem, loss=loss, independent="tracks", max_memory=adjusted.max_memory)
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")
-    why_not = None
+    found, why_not = of_all.covariance, None
     if block.is_georeferenced:
         position = _std(found.centers)
         variance = np.maximum(np.einsum("nii->ni", found.points[: block.num_points]), 0.0)
@@ -82,7 +87,7 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
             "no scale to give them in. Add GNSS positions or ground control."
         )
     factor = found.variance_factor * times**2  # positions' part of the cost is small
-    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found)
+    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, of_all)
 
 
 def with_own_errors(

@@ -67,6 +67,20 @@ def test_summary_and_terminal_tell_control_and_check_apart(run: Run) -> None:
     assert not [text for text in run.facts["adjust"]["findings"] if "ontrol" in text and "contradict" in text]
 
 
+def test_summary_tells_how_each_kind_of_measurement_scatters(run: Run) -> None:
+    found = run.facts["adjust"]["statistics"]
+    kinds = {kind["name"]: kind for kind in found["kinds"]}
+    assert kinds["marks"]["std"] == pytest.approx(0.3, abs=0.1)  # as they were set
+    across, up = kinds["position horizontal"], kinds["position vertical"]
+    assert (across["stated_std"], up["stated_std"]) == (0.03, 0.06)
+    for kind, true in ((across, 0.03), (up, 0.05)):
+        assert abs(np.log(kind["std"] / true)) < 4 * kind["std_share"]
+    assert not kinds["control horizontal"]["is_known"] and not kinds["control vertical"]["is_known"]
+    assert found["unknowns"][:2] == ["fx", "fy"] and found["correlation"][0][1] > 0.8
+    cameras = run.facts["adjust"]["cameras"]
+    np.testing.assert_allclose(next(iter(cameras.values()))["std"][:2], found["unknown_std"][:2])
+
+
 def test_tile_holds_the_control_points_with_their_marks(run: Run, survey: Survey) -> None:
     tile = survey.project / "export" / "tile.npz"
     problem, loss = read_tile(tile), read_loss(tile)

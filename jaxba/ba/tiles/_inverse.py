@@ -25,8 +25,8 @@ from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Call, Engine
 
-Rows = Literal["none", "priors", "all", "tracks"]
-"""Whose leverages are asked for: of all rows those of the reprojections come first; or the sums over tracks alone."""
+Rows = Literal["none", "priors", "all"]
+"""Whose leverages are asked for: of all rows those of the reprojections come first."""
 
 
 class Marginals(NamedTuple):
@@ -58,7 +58,7 @@ class _OfTile(NamedTuple):
     tracks: TrackSums | None
 
 
-def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none") -> None:
+def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none", *, by_tracks: bool = False) -> None:
     """Compile what `marginals` calls, side by side; without it that happens when it is called."""
 
     def calls(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
@@ -72,11 +72,11 @@ def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none") -
         )
         of_points = system, model, inverse, np.zeros(())
         joint = jax.eval_shape(joint_marginals, *of_points)
-        of_all = joint_marginals if rows in ("all", "tracks") else point_marginals
+        of_all = joint_marginals if rows == "all" or by_tracks else point_marginals
         found = [Call(of_all, of_points), Call(squares, (system, part))]
-        if rows == "tracks":
+        if by_tracks:
             found.append(Call(track_sums, (system, part, inverse, joint)))
-        elif rows != "none":
+        if rows != "none":
             found.append(Call(prior_leverages, (system, part, inverse, joint.points)))
         if rows == "all":
             found.append(Call(pixel_leverage, (system, part, inverse, joint)))
@@ -86,11 +86,18 @@ def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none") -
 
 
 def marginals(
-    engine: Engine, problem: Problem, unknowns: Unknowns, damping: float = 0.0, rows: Rows = "none"
+    engine: Engine,
+    problem: Problem,
+    unknowns: Unknowns,
+    damping: float = 0.0,
+    rows: Rows = "none",
+    *,
+    by_tracks: bool = False,
 ) -> Marginals:
     """Return the marginals at some unknowns.
 
-    - `problem`: the engine's. `damping`: that every diagonal is raised by, as a share of it.
+    - `problem`: the engine's. `damping`: that every diagonal is raised by, as a share of it. `by_tracks`: whether the
+      sums over tracks are asked for.
 
     Raises `NotPositive` where the equations have no inverse.
     """
@@ -117,7 +124,7 @@ def marginals(
                 fronts.memory.give_back(whole)
 
     def of_tile(number: int, rest: np.ndarray) -> _OfTile:
-        return _of_tile(engine, unknowns, number, rest, corner, damping, rows)
+        return _of_tile(engine, unknowns, number, rest, corner, damping, rows, by_tracks=by_tracks)
 
     points = np.zeros((len(tree.tile_of_point), 3, 3))
     parts: list[tuple[Squares, ...]] = [()] * len(engine.tiles)
@@ -142,13 +149,13 @@ def marginals(
         np.diagonal(corner) * up.border_diagonal,
         tuple(groups),
         of_rows,
-        TrackSums(*map(sum, zip(*sums, strict=True))) if rows == "tracks" else None,  # type: ignore[arg-type]
+        TrackSums(*map(sum, zip(*sums, strict=True))) if by_tracks else None,  # type: ignore[arg-type]
     )
 
 
 def _empty(problem: Problem, rows: Rows) -> tuple[Leverage, ...]:
     """Return arrays for the leverages of all rows."""
-    if rows in ("none", "tracks"):
+    if rows == "none":
         return ()
     own = Unknowns(problem.poses, np.zeros(problem.free.intrinsics.shape), problem.antenna, problem.points)
     shapes = [(num_rows(prior), jax.eval_shape(prior.residual, own).shape[0]) for prior in problem.priors]
@@ -165,6 +172,8 @@ def _of_tile(
     corner: np.ndarray,
     damping: float,
     rows: Rows,
+    *,
+    by_tracks: bool,
 ) -> _OfTile:
     shape, fronts = engine.shape, engine.fronts
     tile, of_tile = engine.tiles[number]
@@ -193,19 +202,18 @@ def _of_tile(
     groups: list[Leverage] = []
     tracks: TrackSums | None = None
     takes: list[np.ndarray] = []
-    if rows == "all":
+    if rows == "all" or by_tracks:
         joint: Joint = call_compiled(joint_marginals, *of_points)
         points = joint.points
+    else:
+        points = call_compiled(point_marginals, *of_points)
+    if by_tracks:
+        tracks = jax.tree.map(np.asarray, call_compiled(track_sums, system, own, inverse, joint))
+    if rows == "all":
         groups.append(call_compiled(pixel_leverage, system, own, inverse, joint))
         seen = np.flatnonzero(tile.plan.row_observation >= 0)
         takes.append(seen[np.argsort(tile.plan.row_observation[seen])])
-    elif rows == "tracks":
-        joint = call_compiled(joint_marginals, *of_points)
-        points = joint.points
-        tracks = jax.tree.map(np.asarray, call_compiled(track_sums, system, own, inverse, joint))
-    else:
-        points = call_compiled(point_marginals, *of_points)
-    if rows in ("priors", "all"):
+    if rows != "none":
         groups += call_compiled(prior_leverages, system, own, inverse, points)
         takes += [np.arange(len(places)) for places in tile.prior_rows]  # what follows is padding
     of_rows = tuple(Leverage(*(np.asarray(part)[take] for part in of)) for of, take in zip(groups, takes, strict=True))

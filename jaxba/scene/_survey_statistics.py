@@ -1,0 +1,42 @@
+"""What an adjustment says of its measurements and of the unknowns that all images share."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredKind:
+    """One kind of measurement: how its errors scatter beside what was stated.
+
+    - `name`: tie points, marks, position horizontal, ... `unit`: of sigmas: px, m or deg.
+    - `count`, `redundancy`: measured components, and their redundancy numbers summed.
+    - `std`: that the residuals show, and `std_share`, its own sigma over it. `stated_std`: NaN where nobody states one.
+    - `is_known`: whether there is enough redundancy to rely on `std`.
+    """
+
+    name: str
+    unit: str
+    count: int
+    redundancy: float
+    std: float
+    std_share: float
+    stated_std: float
+    is_known: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurveyStatistics:
+    """Statistics of an adjusted block.
+
+    - `redundancy`: of all measurements together. `kinds`: of them.
+    - `unknowns`: names of what images share: intrinsics, offsets of positions. `unknown_std`: sigmas, in their units.
+    - `correlation`: among these; NaN of what is fixed.
+    """
+
+    redundancy: int
+    kinds: tuple[MeasuredKind, ...]
+    unknowns: tuple[str, ...]
+    unknown_std: Float[np.ndarray, " unknowns"]
+    correlation: Float[np.ndarray, "unknowns unknowns"]

@@ -27,12 +27,13 @@ from jaxba._errors import JaxbaError
 from jaxba.ba._adjoint import Adjoint
 from jaxba.ba._linearise import linearise
 from jaxba.ba._plan import Plan, make_plan
-from jaxba.ba._problem import Problem
+from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._system import initial_unknowns, make_system
 from jaxba.ba._traced import solve_to_the_last_digits
 from jaxba.ba.checks import prepare, require_gauge
+from jaxba.ba.groups import ScaleBarPrior
 from jaxba.geometry import AbstractLoss, Linear, require_number
 
 _MOVES, _LARGEST_STEP = 0.05, 5e-3  # sigmas of all unknowns together; of the input's sigma
@@ -88,10 +89,11 @@ class GradientCheck:
 
 @dataclasses.dataclass(frozen=True)
 class _Input:
-    """A leaf of (problem, loss), and the size of a step of each of its numbers."""
+    """A leaf of (problem, loss), and the size of a step of each of its numbers; `alike` rows in turn change as one."""
 
     where: Callable[[tuple[Problem, AbstractLoss]], Any]
     scale: Float[np.ndarray, "..."]
+    alike: int = 1
 
 
 def check_gradients(
@@ -159,7 +161,9 @@ def _rows(problem: Problem, loss: AbstractLoss, plan: Plan, rng: np.random.Gener
     pull = jax.linear_transpose(push, values)
     gradient = pull((_pull_back(problem, cotangent, optimum), jnp.zeros(())))[0]
     for name, an_input in inputs.items():
-        along = rng.normal(size=values[name].shape) * an_input.scale
+        shape = values[name].shape
+        along = rng.normal(size=(*(shape[:1] and (shape[0] // an_input.alike,)), *shape[1:]))
+        along = np.repeat(along, an_input.alike, axis=0) * an_input.scale if shape else along * an_input.scale
         direction = {n: along if n == name else np.zeros_like(v) for n, v in values.items()}
         dot, cost_dot = push(direction)
         found, approximate = (_tangent(problem, jax.device_get(d)) for d in (dot, approximately(direction)[0]))
@@ -227,13 +231,16 @@ def _inputs(problem: Problem, loss: AbstractLoss) -> dict[str, _Input]:
                     found[f"{prior.name} loss scale"] = _Input(
                         lambda t, i=i: t[0].priors[i].loss.f_scale, np.asarray(float(value.f_scale))
                     )
-            elif not field.name.endswith("_index"):
+            elif not (field.name.endswith("_index") or _is_only_counted_from(prior, field.name)):
                 std = np.asarray(getattr(prior, sigmas[0]), float)
                 scale = np.where(np.isfinite(std), std, 0.0)
                 if scale.shape != np.shape(value):
-                    scale = np.broadcast_to(scale.max(axis=1, keepdims=True), np.shape(value))
+                    rows = scale.max(axis=1).reshape(-1, *(1,) * (np.ndim(value) - 1))
+                    scale = np.broadcast_to(rows, np.shape(value))
                 found[f"{prior.name} {field.name}"] = _Input(
-                    lambda t, i=i, field=field: getattr(t[0].priors[i], field.name), scale
+                    lambda t, i=i, field=field: getattr(t[0].priors[i], field.name),
+                    scale,
+                    alike=2 if isinstance(prior, ScaleBarPrior) else 1,
                 )
     fixed_poses, fixed_points = ~np.asarray(free.poses)[:, None], ~np.asarray(free.points)[:, None]
     seen_points = np.zeros((problem.num_points, 1), bool)
@@ -262,6 +269,11 @@ def _inputs(problem: Problem, loss: AbstractLoss) -> dict[str, _Input]:
         if active.any():
             found[f"active {side} bounds"] = _Input(lambda t, side=side: getattr(t[0], side), active * sizes)
     return found
+
+
+def _is_only_counted_from(prior: AbstractPrior, field: str) -> bool:
+    """Whether a field is no measurement: the coordinates that the ends of scale bars are counted from."""
+    return isinstance(prior, ScaleBarPrior) and field in (prior.in_world or ())
 
 
 def _values(solution: Solution) -> tuple[Any, ...]:

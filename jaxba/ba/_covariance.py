@@ -89,7 +89,8 @@ def covariance(
     - `datum`: what the block's place, rotation and scale are known from: `priors`, with what is held fixed, or `inner`
       for photos alone, under inner constraints over the points, whatever priors say.
     - `independent`: of which errors are: `observations`, or only `tracks`, some of which are measured worse than others
-      in all their images. That tells in `border` and in intrinsics that images share (`_track_scores.py`).
+      in all their images. That tells in `border`, intrinsics that images share, lever arm and position offsets
+      (`_track_scores.py`).
     - `max_memory`, `max_observations`, `folder`, `workers`: as in `solve_tiled`.
 
     Raises `JaxbaError` where the problem has no gauge, where something in it is not determined, and where memory or

@@ -80,6 +80,7 @@ def of_photos_alone(label: str, problem: Problem) -> Problem:
         problem,
         priors=tuple(prior for prior in problem.priors if hasattr(prior, "camera_index")),
         free=dataclasses.replace(free, lever_arm=held, position_offset=held),
+        position_offset=np.asarray(problem.position_offset)[: len(problem.position_offset) - problem.num_bar_ends],
     )
 
 

@@ -81,13 +81,26 @@ def rejecting(problem: Problem, *, rounds: int = 2, mad_factor: float = 2.5) -> 
         used = _kept(used, solution)
         problem = solution.apply(problem)
         found = quality(problem, used, mad_factor=mad_factor)
-        fits = found.error_px <= found.threshold_px
+        fits = _with_bar_ends(problem, used, found.error_px <= found.threshold_px)
         if len(num_rejected) == int(rounds) or np.array_equal(fits, used) or solution.result == "interrupted":
             return Rejected(tuple(solutions), used, found, tuple(num_rejected))
         num_rejected.append(int(np.count_nonzero(~fits)))
         used = fits
         solution = yield _with_observations(problem, used)
         solutions.append(solution)
+
+
+def _with_bar_ends(
+    problem: Problem, used: Bool[np.ndarray, " observations"], fits: Bool[np.ndarray, " observations"]
+) -> Bool[np.ndarray, " observations"]:
+    """Return what fits, with all observations of ends of scale bars that would keep fewer than two of them."""
+    bars = problem.prior("scale_bar")
+    if bars is None:
+        return fits
+    point = np.asarray(problem.observations.point_index)
+    few = np.bincount(point[fits], minlength=problem.num_points) < 2
+    is_end = np.isin(np.arange(problem.num_points), np.asarray(vars(bars)["point_index"]))
+    return fits | (used & (few & is_end)[point])
 
 
 def _with_observations(problem: Problem, used: Bool[np.ndarray, " observations"]) -> Problem:

@@ -36,7 +36,12 @@ def with_scale_bars(
     >>> jaxba.ba.free_gauge(problem), jaxba.ba.free_gauge(jaxba.with_scale_bars(problem, [3], [90], [52.1], [0.01]))
     (('scale',), ())
     """
-    ends = np.stack([np.asarray(first), np.asarray(second)], axis=-1)
+    one, other = np.asarray(first), np.asarray(second)
+    if not (
+        one.shape == other.shape == (one.size,) and one.dtype.kind in "iu" and other.dtype.kind in "iu" and one.size
+    ):
+        raise JaxbaError("with_scale_bars: give one point number or more in first, and as many in second.")
+    ends = np.stack([one, other], axis=-1)
     length_m, std_m = np.asarray(length_m, float), np.asarray(std_m, float)
     _require(problem, ends, length_m, std_m)
     problem = _without_held_offsets(problem)
@@ -64,8 +69,6 @@ def with_scale_bars(
 def _require(problem: Problem, ends: np.ndarray, length_m: np.ndarray, std_m: np.ndarray) -> None:
     if problem.prior(ScaleBarPrior.name) is not None:
         raise JaxbaError("with_scale_bars: the problem has scale bars already; give all of them at once.")
-    if not ends.shape == (len(ends), 2) or ends.dtype.kind not in "iu" or not len(ends):
-        raise JaxbaError("with_scale_bars: give one point number or more in first, and as many in second.")
     for name, values in (("length_m", length_m), ("std_m", std_m)):
         if values.shape != (len(ends),):
             raise JaxbaError(f"with_scale_bars: {name} has shape {values.shape} for {len(ends)} bars; give one a bar.")

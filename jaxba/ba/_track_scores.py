@@ -68,7 +68,7 @@ def track_sums(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint
         index = part.point_index.reshape(-1)
         of_rows = jnp.einsum("rlcb,rcl->rlb", pull, residual).reshape(len(index), -1)
         seen = (jnp.asarray(part.weight) > 0).reshape(-1).astype(views.dtype)
-        flat = pull.reshape(-1, pull.shape[-1])
+        flat = pull.reshape(2 * len(index), pull.shape[-1])
         return (
             scores + segments(of_rows, index, shape.num_points),
             views + segments(seen, index, shape.num_points),

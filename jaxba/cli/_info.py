@@ -64,7 +64,7 @@ def facts(problem: Problem) -> dict[str, Any]:
             "points": int(np.count_nonzero(free.points)),
             "intrinsics": {name: int(np.count_nonzero(free_intrinsics[:, i])) for i, name in enumerate(names)},
             "lever_arm": bool(free.lever_arm),
-            "position_offset": bool(free.position_offset),
+            "position_offset": bool(free.position_offset) and len(problem.position_offset) > problem.num_bar_ends,
         },
         "bounds": {
             name: {"lower": float(lower[:, i].min()), "upper": float(upper[:, i].max())}

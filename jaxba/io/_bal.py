@@ -229,7 +229,8 @@ def what_bal_cannot_hold(problem: Problem) -> list[str]:
         lost.append("bounds")
     if np.any(problem.lever_arm) or np.any(free.lever_arm):
         lost.append("a lever arm")
-    if np.any(problem.position_offset) or np.any(free.position_offset):
+    offsets = len(problem.position_offset) - problem.num_bar_ends
+    if offsets and (np.any(problem.position_offset[:offsets]) or np.any(free.position_offset)):
         lost.append("an offset of positions")
     if problem.image_names:
         lost.append("image names")

@@ -4,6 +4,7 @@ CSV with a header line, `first`, `second`, `length_m` and, if known, `std_m`; or
 without one. Points are called by their names in the lists of control and check points; lengths are metres.
 """
 
+import re
 from dataclasses import dataclass
 
 from jaxba._errors import JaxbaError
@@ -17,6 +18,7 @@ BAR_COLUMNS = {
     "std_m": ("std_m", "std", "accuracy", "accuracy_m", "sigma", "sigma_m"),
 }
 """Titles of the columns, as `plain_title` writes them."""
+_UNIT, _METRES = re.compile(r"[\[(](.*?)[\])]"), ("m", "metre", "metres", "meter", "meters", "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +37,9 @@ def parse_bars(text: str, name: str = "bars.csv") -> tuple[MeasuredBar, ...]:
 
     - `name`: of the file, for messages.
 
-    Raises `JaxbaError` with file, line, field and value for what cannot be read, a length or sigma that is not above 0,
-    a bar from a point to itself, and two bars between the same points.
+    Raises `JaxbaError` with file, line, field and value for what cannot be read, a length that is not above 0, a sigma
+    below it (0 is one that is not known), a title with another unit than metres, a bar from a point to itself, and two
+    bars between the same points.
 
     >>> [(bar.first, bar.second, bar.length_m) for bar in parse_bars("first,second,length_m\\nA,B,12.5")]
     [('A', 'B', 12.5)]
@@ -53,6 +56,8 @@ def parse_bars(text: str, name: str = "bars.csv") -> tuple[MeasuredBar, ...]:
         missing = [column for column in ("first", "second", "length_m") if column not in place]
         if missing:
             raise JaxbaError(f"{name} line {table.line}: columns {', '.join(table.header)} lack {', '.join(missing)}.")
+        for column in ("length_m", "std_m"):
+            _refuse_unit(table.header[place[column]] if column in place else "", f"{name} line {table.line}")
         rows = [(line, {column: cell(column) for column in BAR_COLUMNS}) for line, cell in csv_rows(table, place, name)]
     if not rows:
         raise JaxbaError(f"{name}: lists no bar; {form}")
@@ -66,6 +71,12 @@ def parse_bars(text: str, name: str = "bars.csv") -> tuple[MeasuredBar, ...]:
                 "mean, or keep one of them."
             )
     return bars
+
+
+def _refuse_unit(title: str, where: str) -> None:
+    unit = _UNIT.search(title)
+    if unit and unit[1].strip().lower() not in _METRES:
+        raise JaxbaError(f"{where}: {title} is in {unit[1].strip()}; give metres, and write so.")
 
 
 def _by_blanks(words: str, where: str, form: str) -> dict[str, str]:

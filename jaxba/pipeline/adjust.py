@@ -1,6 +1,7 @@
 """Stage adjust: the bundle adjustment in rounds, with rejection, pruning of edges and triangulation anew."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -182,7 +183,10 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
     control = dataclasses.replace(inputs.control, mark_std_px=adjusted.mark_std_px)
     controlled = sfm.apply_control(adjusted, sigmas, control, reference)
     reference = sfm.without_offsets(reference, flights)
-    block = controlled.block
+    block, bar_fit = controlled.block, adjusted.bars
+    if controlled.fit.method in ("helmert", "affine") and inputs.bars.num:
+        mapped = functools.partial(sfm.apply_affine, controlled.affine)
+        bar_fit = sfm.compared_bars(block, mapped, inputs.bars, control)
     fit = sfm.gnss_fit(block, reference)
     sigmas = controlled.sigmas
     found = sfm.findings(
@@ -201,7 +205,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
     )
     found = (
         *on_control,
-        *sfm.bar_findings(inputs.bars, adjusted.bars, block),
+        *sfm.bar_findings(inputs.bars, bar_fit, block),
         *found,
         *(Finding.of("note", text=f"{note}.") for note in notes),
     )
@@ -231,11 +235,13 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         control=controlled.fit,
         mark_used=adjusted.mark_used,
         mark_std_px=adjusted.mark_std_px,
-        bars=adjusted.bars,
+        bars=bar_fit,
         spread=adjusted.spread,
         loss=params.loss,
         loss_f_scale=float(adjusted.loss.f_scale) / adjusted.spread,
-        statistics=None if judged is None else sfm.survey_statistics(adjusted, judged, inputs.reference),
+        statistics=None
+        if judged is None
+        else sfm.survey_statistics(adjusted, judged, inputs.reference, inputs.control),
         affine=controlled.affine,
     )
 

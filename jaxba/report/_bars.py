@@ -72,8 +72,12 @@ def _contradicts(
     )
 
 
-def _contradicts_others(name: str) -> str:
-    return f"Scale bar {name} contradicts the other bars, and was set aside; check its length, its unit and the marks."
+def _contradict_each_other(names: Sequence[str], has_scale: bool) -> str:
+    without = "" if has_scale else ", and the block has no scale"
+    return (
+        f"Scale bars {some(list(names))} contradict each other, and nothing tells which is wrong: all of them were set "
+        f"aside{without}. Check their lengths, units and marks."
+    )
 
 
 def _scale(count: int) -> str:
@@ -83,6 +87,6 @@ def _scale(count: int) -> str:
 BAR_WORDS: dict[str, Callable[..., str]] = {
     "scale bars without ends": _without_ends,
     "scale bar contradicts": _contradicts,
-    "scale bar contradicts others": _contradicts_others,
+    "scale bars contradict each other": _contradict_each_other,
     "scale by bars": _scale,
 }

@@ -22,8 +22,11 @@ def control_lines(control: Control, notes: Sequence[str], left_out: Sequence[Lef
     first = f"{many(count, 'control point')}, {many(checks, 'check point')}"
     if bars.num:
         first = f"{first}, {many(bars.num, 'scale bar')}"
-    first = f"{first}; {many(len(control.mark_point), 'mark')}"
-    images = len(np.unique(control.mark_image))
+    marked = np.concatenate(
+        [np.column_stack([of.mark_image, of.mark_xy_px]) for of in (control, bars.ends)]
+    )  # those of a control point at the end of a bar stand in both
+    first = f"{first}; {many(len(np.unique(marked, axis=0)), 'mark')}"
+    images = len(np.unique(marked[:, 0]))
     left = [f"Left out: {entry.name}: {entry.reason}." for entry in left_out]
     if len(left) > _SHOWN:
         left = [*left[:_SHOWN], f"and {len(left) - _SHOWN} more such, each with its reason in summary.json."]

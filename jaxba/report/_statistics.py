@@ -55,8 +55,8 @@ def _or_none(value: Any) -> Any:
 def _text(kind: dict[str, Any]) -> str:
     decimals = 1 if kind["unit"] == "deg" else 3 if kind["unit"] == "m" and kind["std"] < 1 else 2
     text = f"{_name(kind)} {kind['std']:.{decimals}f} {kind['unit']}"
-    stated = kind["stated_std"]
-    return text if stated is None else f"{text} ({stated:.{decimals}f} stated)"
+    taken = kind["taken_std"]
+    return text if taken is None else f"{text} (taken as {taken:.{decimals}f})"
 
 
 def _name(kind: dict[str, Any]) -> str:

@@ -49,7 +49,8 @@ class BarFit:
     - `distance_m`: between the ends in the result. `distance_std_m`: its sigma, NaN where that was not computed.
     - `residual_m`: adjusted minus measured. `over_sigma`: what the result says without the bar, minus the measured
       length, over the sigma of that difference.
-    - `is_used`: the bar took part. `is_set_aside`: it would have, and contradicts all else.
+    - `is_used`: the bar took part. `is_set_aside`: it would have, and contradicts all else. `is_unclear`: or
+      others do that were set aside with it, and nothing tells which.
     """
 
     distance_m: Float[np.ndarray, " bars"]
@@ -58,6 +59,7 @@ class BarFit:
     over_sigma: Float[np.ndarray, " bars"]
     is_used: Bool[np.ndarray, " bars"]
     is_set_aside: Bool[np.ndarray, " bars"]
+    is_unclear: Bool[np.ndarray, " bars"]
 
     @staticmethod
     def nothing(num: int = 0) -> "BarFit":
@@ -70,4 +72,5 @@ class BarFit:
             over_sigma=unknown,
             is_used=no,
             is_set_aside=no,
+            is_unclear=no,
         )

@@ -12,7 +12,8 @@ class MeasuredKind:
 
     - `name`: tie points, marks, position horizontal, ... `unit`: of sigmas: px, m or deg.
     - `count`, `redundancy`: measured components, and their redundancy numbers summed.
-    - `std`: that the residuals show, and `std_share`, its own sigma over it. `stated_std`: NaN where nobody states one.
+    - `std`: that the residuals show, and `std_share`, its own sigma over it. `taken_std`: that it
+      was taken to have, from tags, lists or parameters; NaN where nothing says one.
     - `is_known`: whether there is enough redundancy to rely on `std`.
     """
 
@@ -22,7 +23,7 @@ class MeasuredKind:
     redundancy: float
     std: float
     std_share: float
-    stated_std: float
+    taken_std: float
     is_known: bool
 
 

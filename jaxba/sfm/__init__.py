@@ -11,6 +11,7 @@ from jaxba.sfm._findings import GnssFit, findings, gnss_fit, height_above_ground
 from jaxba.sfm._flights import flight_offsets, without_offsets
 from jaxba.sfm._initialise import initialise
 from jaxba.sfm._intrinsics import AtBound, free_parameters, intrinsics_at_bounds
+from jaxba.sfm._onto_bars import compared as compared_bars
 from jaxba.sfm._points import with_points
 from jaxba.sfm._problem import positions_hold, to_problem
 from jaxba.sfm._rounds import Settings, Tiling
@@ -20,8 +21,8 @@ from jaxba.sfm._uncertainty import Uncertainty, uncertainty
 
 __all__ = [
     "Adjusted", "AtBound", "Controlled", "GnssFit", "Settings", "Tiling", "Uncertainty", "add_bars", "adjust",
-    "agreeing_marks", "apply_affine", "apply_control", "bar_findings", "control_findings", "control_part", "findings",
-    "flight_offsets", "free_parameters", "gnss_fit", "height_above_ground", "initialise", "intrinsics_at_bounds",
-    "place_by_control", "positions_hold", "survey_statistics", "to_problem", "transformed", "uncertainty", "weighed",
-    "with_points", "without_offsets",
+    "agreeing_marks", "apply_affine", "apply_control", "bar_findings", "compared_bars", "control_findings",
+    "control_part", "findings", "flight_offsets", "free_parameters", "gnss_fit", "height_above_ground", "initialise",
+    "intrinsics_at_bounds", "place_by_control", "positions_hold", "survey_statistics", "to_problem", "transformed",
+    "uncertainty", "weighed", "with_points", "without_offsets",
 ]  # fmt: skip

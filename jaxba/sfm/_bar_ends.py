@@ -20,11 +20,13 @@ class BarEnds:
     """The ends of bars as a block has them.
 
     - `bars`: with the sigma of marks. `mark_used`: of theirs. `point_m`: of each end, NaN where it has no place.
+    - `variance_m2`: of each, by its marks alone.
     """
 
     bars: ScaleBars
     mark_used: Bool[np.ndarray, " marks"]
     point_m: Float[np.ndarray, "ends 3"]
+    variance_m2: Float[np.ndarray, "ends 3"]
 
     @staticmethod
     def of(block: Block, bars: ScaleBars, control: Control) -> "BarEnds":
@@ -33,7 +35,8 @@ class BarEnds:
         std_px = control.mark_std_px if control.num_points else mark_std(block, ends, use)
         ends = dataclasses.replace(ends, mark_std_px=std_px)
         use = agreeing_marks(block, ends) & (image_rows(block, ends) >= 0)
-        return BarEnds(dataclasses.replace(bars, ends=ends), use, intersect(block, ends, use).point_m)
+        found = intersect(block, ends, use)
+        return BarEnds(dataclasses.replace(bars, ends=ends), use, found.point_m, found.variance_m2)
 
     @property
     def has_place(self) -> Bool[np.ndarray, " bars"]:

@@ -14,20 +14,23 @@ def bar_findings(bars: ScaleBars, fit: BarFit, block: Block) -> tuple[Finding, .
         found.append(Finding.of("scale bars without ends", names=[bars.names[k] for k in lost]))
     with np.errstate(invalid="ignore"):
         is_off = fit.is_set_aside | (~fit.is_used & (np.abs(fit.over_sigma) > OUTLIER))
-    if block.is_georeferenced:
-        found += [
-            Finding.of(
-                "scale bar contradicts",
-                name=bars.names[k],
-                length_m=float(bars.length_m[k]),
-                residual_m=float(fit.residual_m[k]),
-                over_sigma=float(abs(fit.over_sigma[k])),
-                limit=OUTLIER,
-                is_set_aside=bool(fit.is_set_aside[k]),
-            )
-            for k in np.flatnonzero(is_off)
-        ]
-    elif fit.is_used.any():
-        found += [Finding.of("scale bar contradicts others", name=bars.names[k]) for k in np.flatnonzero(is_off)]
+    has_scale = block.is_georeferenced or bool(fit.is_used.any())
+    if fit.is_unclear.any():
+        names = [bars.names[k] for k in np.flatnonzero(fit.is_unclear)]
+        found.append(Finding.of("scale bars contradict each other", names=names, has_scale=has_scale))
+    found += [
+        Finding.of(
+            "scale bar contradicts",
+            name=bars.names[k],
+            length_m=float(bars.length_m[k]),
+            residual_m=float(fit.residual_m[k]),
+            over_sigma=float(abs(fit.over_sigma[k])),
+            limit=OUTLIER,
+            is_set_aside=bool(fit.is_set_aside[k]),
+        )
+        for k in np.flatnonzero(is_off & ~fit.is_unclear)
+        if has_scale
+    ]
+    if not block.is_georeferenced and fit.is_used.any():
         found.append(Finding.of("scale by bars", count=int(fit.is_used.sum())))
     return tuple(found)

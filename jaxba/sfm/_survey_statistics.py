@@ -3,17 +3,19 @@
 import numpy as np
 
 from jaxba.ba import Statistics, VarianceComponent
-from jaxba.scene import Block, MeasuredKind, Reference, SurveyStatistics
+from jaxba.scene import Block, Control, MeasuredKind, Reference, SurveyStatistics
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._measured import used_positions
 
 _DEGREES = {"attitude"}
 
 
-def survey_statistics(adjusted: Adjusted, found: Statistics, reference: Reference) -> SurveyStatistics:
+def survey_statistics(
+    adjusted: Adjusted, found: Statistics, reference: Reference, control: Control
+) -> SurveyStatistics:
     """Return them; `found`: of the problem as its errors show it."""
-    stated = _stated(adjusted, reference)
-    kinds = tuple(_kind(one, stated[one.name]) for one in found.components if one.name in stated)
+    taken = _taken(adjusted, reference, control)
+    kinds = tuple(_kind(one, taken[one.name]) for one in found.components if one.name in taken)
     covariance = found.covariance
     single = adjusted.block.camera_parameters.shape[0] == 1
     return SurveyStatistics(
@@ -25,7 +27,7 @@ def survey_statistics(adjusted: Adjusted, found: Statistics, reference: Referenc
     )
 
 
-def _kind(one: VarianceComponent, stated_std: float) -> MeasuredKind:
+def _kind(one: VarianceComponent, taken_std: float) -> MeasuredKind:
     turn = one.group in _DEGREES
     return MeasuredKind(
         name=one.name,
@@ -34,37 +36,35 @@ def _kind(one: VarianceComponent, stated_std: float) -> MeasuredKind:
         redundancy=one.redundancy,
         std=float(np.degrees(one.std)) if turn else one.std,
         std_share=one.factor_std / (2 * one.factor) if one.factor > 0 else float("nan"),
-        stated_std=stated_std,
+        taken_std=taken_std,
         is_known=one.is_known,
     )
 
 
-def _stated(adjusted: Adjusted, reference: Reference) -> dict[str, float]:
-    """Return the kinds that were measured, and the median of the sigmas that are stated; NaN where none are."""
-    block, nan = adjusted.block, float("nan")
-    stated = {"tie points": nan, "marks": nan}
-    if block.is_georeferenced:
-        stated |= _of_reference(block, reference)
+def _taken(adjusted: Adjusted, reference: Reference, control: Control) -> dict[str, float]:
+    """Return the kinds that were measured, and the median of the sigmas that they were taken to have, or NaN."""
+    nan = float("nan")
+    taken = {"tie points": nan, "marks": nan if control.mark_std_is_assumed else control.mark_std_px}
+    if adjusted.block.is_georeferenced:
+        taken |= _of_reference(adjusted.block, reference)
     if adjusted.control is not None:
-        std_m = np.where(np.isfinite(adjusted.control.std_m), adjusted.control.std_m, np.nan)
-        for name, axes in (("control horizontal", slice(0, 2)), ("control vertical", slice(2, 3))):
-            known = std_m[:, axes][np.isfinite(std_m[:, axes])]
-            if len(known):
-                stated[name] = float(np.median(known))
+        std_m = control.std_m[adjusted.control.rows]
+        taken |= _medians({"control horizontal": std_m[:, :2], "control vertical": std_m[:, 2:]})
     bars = adjusted.problem.prior("scale_bar")
     if bars is not None:
-        stated["scale bar"] = float(np.median(vars(bars)["std_m"]))
-    return stated
+        taken |= _medians({"scale bar": np.asarray(vars(bars)["std_m"])})
+    return taken
+
+
+def _medians(std_m: dict[str, np.ndarray]) -> dict[str, float]:
+    """Return the medians of the finite sigmas, where there are any."""
+    return {name: float(np.median(std[np.isfinite(std)])) for name, std in std_m.items() if np.isfinite(std).any()}
 
 
 def _of_reference(block: Block, reference: Reference) -> dict[str, float]:
     index = block.image_index[used_positions(block, reference)]
-    std_m = np.where(np.isfinite(reference.xyz_m[index]), reference.std_m[index], np.nan)
-    stated = {}
-    for name, axes in (("position horizontal", slice(0, 2)), ("position vertical", slice(2, 3))):
-        known = std_m[:, axes][np.isfinite(std_m[:, axes])]
-        if len(known):
-            stated[name] = float(np.median(known))
+    std_m = np.where(np.isfinite(reference.xyz_m[index]), reference.std_m[index], np.inf)
+    taken = _medians({"position horizontal": std_m[:, :2], "position vertical": std_m[:, 2:]})
     if np.isfinite(reference.quaternion[block.image_index]).all(axis=1).any():
-        stated["attitude"] = float("nan")  # what tags state is raised, for errors that all of a flight share
-    return stated
+        taken["attitude"] = float("nan")  # what tags state is raised, for errors that all of a flight share
+    return taken

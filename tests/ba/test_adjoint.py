@@ -230,7 +230,9 @@ def test_traced_indices_need_a_plan(block: Problem):
 
 def test_every_input_has_the_derivative_of_central_differences():
     loss = jaxba.Barron(0.5, 2.0)
-    problem = small_problem(SIMPLE, lever_arm=True, position_offset=True, num_outliers=3, prior_loss=Cauchy(3.0))
+    problem = with_bars(
+        small_problem(SIMPLE, lever_arm=True, position_offset=True, num_outliers=3, prior_loss=Cauchy(3.0))
+    )
     true = 500.0  # the optimum without bounds is some 2 px off
     problem = eqx.tree_at(lambda p: p.cameras.cx, problem, np.array([true - 9.0]))
     problem = problem.bound(cx=(true - 12.0, true - 6.0)).fix(points=[4], intrinsics=["cy"])
@@ -246,6 +248,8 @@ def test_every_input_has_the_derivative_of_central_differences():
         "attitude std_rad",
         "lever_arm std_m",
         "position_offset std_m",
+        "scale_bar length_m",
+        "scale_bar std_m",
         "position loss scale",
         "active upper bounds",
         "fixed cy",

@@ -296,6 +296,11 @@ def test_unknown_without_measurements_is_named():
         covariance(loose)
 
 
+def test_without_shared_unknowns_tracks_tell_what_observations_do():
+    problem = small_block().fix(intrinsics=True)
+    assert_same(covariance(problem, independent="tracks").centers, covariance(problem).centers)
+
+
 @pytest.mark.parametrize(
     ("case", "num_tiles"),
     [

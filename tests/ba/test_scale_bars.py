@@ -16,7 +16,7 @@ import jaxba
 from jaxba._errors import JaxbaError
 from jaxba.ba import AbstractPrior, Problem, Rows, ScaleBarPrior, Unknowns, free_gauge, with_scale_bars
 from jaxba.ba._projection import camera_centers
-from jaxba.geometry import AbstractLoss, Linear
+from jaxba.geometry import AbstractLoss, Cauchy, Linear
 
 
 class PlainBars(AbstractPrior):
@@ -135,6 +135,7 @@ def test_a_bar_sets_the_scale_of_a_free_block(without: Problem):
         (([2], [9], [1.0], [np.nan]), "bar 0 has std_m=nan"),
         (([2], [9], [1.0, 2.0], [0.1]), r"length_m has shape \(2,\) for 1 bars"),
         (([], [], [], []), "give one point number or more"),
+        (([1, 2], [3], [1.0], [0.1]), "and as many in second"),
     ],
 )
 def test_bars_that_cannot_be_are_refused(without: Problem, given: tuple, message: str):
@@ -149,8 +150,28 @@ def test_bars_twice_a_bar_cut_in_two_and_tiles_are_refused(without: Problem):
     half = dataclasses.replace(problem, free=dataclasses.replace(problem.free, position_offset=np.array(False)))
     with pytest.raises(JaxbaError, match="two rows, one after the other, are one bar"):
         jaxba.solve(half)
+    robust = dataclasses.replace(problem.prior("scale_bar"), loss=Cauchy(2.0))
+    with pytest.raises(JaxbaError, match="prior scale_bar: loss Cauchy; it is to be Linear"):
+        jaxba.solve(dataclasses.replace(problem, priors=(*problem.priors[:-1], robust)))
     with pytest.raises(JaxbaError, match="the block has scale bars"):
         jaxba.partition(problem, max_images=2, overlap=1)
+
+
+def test_rejection_leaves_an_end_the_two_observations_that_it_needs(without: Problem):
+    problem = with_bars(without)
+    seen = problem.observations
+    mine = np.flatnonzero(np.asarray(seen.point_index) == 9)
+    kept = np.setdiff1d(np.arange(problem.num_observations), mine[2:])
+    xy_px = np.array(seen.xy_px)
+    xy_px[mine[0]] += 60.0
+    few = jaxba.Observations(xy_px[kept], seen.std_px[kept], seen.image_index[kept], seen.point_index[kept])
+    found = jaxba.solve_and_reject(dataclasses.replace(problem, observations=few), loss=Cauchy(2.0))
+    assert found.used[np.isin(kept, mine[:2])].all() and not found.used.all()
+
+
+def test_inner_constraints_know_no_ends(without: Problem):
+    found = jaxba.covariance(with_bars(without), datum="inner")
+    assert found.position_offset.shape == (6, 6)
 
 
 def test_offsets_that_are_held_go_into_the_positions(without: Problem):

@@ -113,7 +113,7 @@ def with_change(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     ("stage", "module", "before", "after"),
     [
         ("adjust", "jaxba.pipeline.adjust", "median {outputs.median_px:.2f} px", "{outputs.median_px:.2f} px median"),
-        ("adjust", "jaxba.pipeline.adjust", "import Told,", "import Picture, Told,"),
+        ("adjust", "jaxba.pipeline.adjust", "    Told,\n", "    Picture,\n    Told,\n"),
         ("adjust", "jaxba.report._reasons", "more such files", "more of these"),
         ("adjust", "jaxba.report._findings", "look at the edges", "see the edges"),
         # export imports the stage adjust, and match the stage features

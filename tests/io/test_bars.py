@@ -35,6 +35,7 @@ def test_lines_without_a_header_are_read() -> None:
         ("first,second,length_m\n", "bars.csv: lists no bar"),
         ("first,second,std_m\nA,B,1\n", "bars.csv line 1: columns first, second, std_m lack length_m"),
         ("A B\n", "bars.csv line 1: 'A B' has 2 columns; give a line a bar"),
+        ("first,second,length (ft)\nA,B,3\n", "bars.csv line 1: length (ft) is in ft; give metres"),
         ("A B 1 2 3\n", "has 5 columns"),
         ("A A 1\n", "line 1: the bar begins and ends at A"),
         ("A B 12,5\n", "line 1: length_m '12,5' is no number"),

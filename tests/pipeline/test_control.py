@@ -423,7 +423,7 @@ def test_bars_end_at_points_of_the_lists_with_coordinates_or_without() -> None:
     assert made.control.names == ("gcp0", "gcp1", "gcp2", "gcp3") and len(made.control.mark_point) == 16
     assert made.notes[0] != "" and not [note for note in made.notes if "t0" in note]
     told = control.lines(made, Told(photos=()))
-    assert told[0] == "4 control points, 0 check points, 2 scale bars; 16 marks in 4 photos"
+    assert told[0] == "4 control points, 0 check points, 2 scale bars; 22 marks in 4 photos"
     assert [bar["first"] for bar in control.facts(made, Told(photos=()))["bars"]] == ["gcp0", "t0"]
 
 

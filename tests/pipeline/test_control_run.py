@@ -72,7 +72,7 @@ def test_summary_tells_how_each_kind_of_measurement_scatters(run: Run) -> None:
     kinds = {kind["name"]: kind for kind in found["kinds"]}
     assert kinds["marks"]["std"] == pytest.approx(0.3, abs=0.1)  # as they were set
     across, up = kinds["position horizontal"], kinds["position vertical"]
-    assert (across["stated_std"], up["stated_std"]) == (0.03, 0.06)
+    assert (across["taken_std"], up["taken_std"]) == (0.03, 0.06)
     for kind, true in ((across, 0.03), (up, 0.05)):
         assert abs(np.log(kind["std"] / true)) < 4 * kind["std_share"]
     assert not kinds["control horizontal"]["is_known"] and not kinds["control vertical"]["is_known"]

@@ -42,8 +42,14 @@ CASES = [
         "sigma (limit 3.29). It was set aside. Check the length, its unit and the marks.",
     ),
     (
-        Finding.of("scale bar contradicts others", name="a-b"),
-        "Scale bar a-b contradicts the other bars, and was set aside; check its length, its unit and the marks.",
+        Finding.of("scale bars contradict each other", names=["a-b", "c-d"], has_scale=False),
+        "Scale bars a-b, c-d contradict each other, and nothing tells which is wrong: all of them were set aside, and "
+        "the block has no scale. Check their lengths, units and marks.",
+    ),
+    (
+        Finding.of("scale bars contradict each other", names=["a-b", "c-d"], has_scale=True),
+        "Scale bars a-b, c-d contradict each other, and nothing tells which is wrong: all of them were set aside. "
+        "Check their lengths, units and marks.",
     ),
     (
         Finding.of("scale by bars", count=1),

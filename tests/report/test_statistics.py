@@ -9,7 +9,7 @@ from jaxba.report._summary import _finite
 from jaxba.scene import MeasuredKind, SurveyStatistics
 
 
-def kind(name: str, unit: str, std: float, stated_std: float = float("nan"), *, is_known: bool = True) -> MeasuredKind:
+def kind(name: str, unit: str, std: float, taken_std: float = float("nan"), *, is_known: bool = True) -> MeasuredKind:
     return MeasuredKind(
         name=name,
         unit=unit,
@@ -17,7 +17,7 @@ def kind(name: str, unit: str, std: float, stated_std: float = float("nan"), *, 
         redundancy=15.0 if is_known else 2.0,
         std=std,
         std_share=0.18,
-        stated_std=stated_std,
+        taken_std=taken_std,
         is_known=is_known,
     )
 
@@ -39,13 +39,13 @@ FOUND = SurveyStatistics(
 )
 
 
-def test_each_kind_is_told_beside_what_was_stated() -> None:
+def test_each_kind_is_told_beside_what_it_was_taken_for() -> None:
     facts = json.loads(json.dumps(_finite(statistics_facts(FOUND))))  # as summary.json has them
     assert statistics_rows(facts) == [
         (
             "scatter",
-            "tie points 0.17 px, positions across 0.018 m (0.030 stated), positions up 6.30 m (5.00 stated), attitudes "
-            "1.4 deg; too little redundancy to tell those of control across",
+            "tie points 0.17 px, positions across 0.018 m (taken as 0.030), positions up 6.30 m (taken as 5.00), "
+            "attitudes 1.4 deg; too little redundancy to tell those of control across",
         ),
         ("correlated", "fx and fy +0.99, fy and k1 -0.84"),
     ]

@@ -92,6 +92,20 @@ def test_a_wrong_bar_is_set_aside_and_no_other(survey: Simulated, ends: Control,
     assert "m shorter than the" in said[0] and "It was set aside." in said[0]
 
 
+@pytest.mark.parametrize("times", [1.1, 3.28])
+def test_a_single_bar_is_tested_before_it_may_pull(survey: Simulated, ends: Control, times: float) -> None:
+    every = bars_of(ends)
+    one = dataclasses.replace(
+        every,
+        **{name: getattr(every, name)[:1] for name in ("first", "second", "std_m", "is_check")},
+        length_m=every.length_m[:1] * times,
+    )
+    found = adjusted(survey, one)
+    assert found.bars.is_set_aside.all() and not found.bars.is_unclear.any()
+    assert abs(scale_error(survey, found.block)) < 0.05  # as positions have it
+    assert len(sfm.bar_findings(one, found.bars, found.block)) == 1
+
+
 def test_a_bar_at_a_check_point_is_compared_alone(survey: Simulated, ends: Control) -> None:
     bars = bars_of(ends, (0.0, 0.0, 0.5), check=2)
     found = adjusted(survey, bars)
@@ -121,6 +135,41 @@ def test_a_block_without_a_place_takes_the_scale_of_its_bars(survey: Simulated, 
     assert said == ["3 scale bars told the scale of a block that has no place on earth: it is in metres."]
     bare = adjusted(survey, ScaleBars.nothing(), nowhere, **small)
     assert scale_error(survey, bare.block) < -0.9
+
+
+def test_two_bars_against_each_other_tell_no_scale_and_three_tell_which_is_wrong(
+    survey: Simulated, ends: Control
+) -> None:
+    nowhere = dataclasses.replace(
+        survey.reference,
+        xyz_m=np.full((12, 3), np.nan),
+        std_m=np.full((12, 3), np.nan),
+        is_used=np.zeros(12, bool),
+        quaternion=np.full((12, 4), np.nan),
+    )
+    small = {"translation_m": survey.block.translation_m / 40.0, "is_georeferenced": False}
+    bars = bars_of(ends)
+    in_feet = dataclasses.replace(bars, length_m=bars.length_m * [1.0, 3.28, 1.0])
+    found = adjusted(survey, in_feet, nowhere, **small)
+    assert found.bars.is_set_aside.tolist() == [False, True, False]
+    assert abs(scale_error(survey, found.block)) < 2e-4
+    names = ("first", "second", "length_m", "std_m", "is_check")
+    two = dataclasses.replace(in_feet, **{name: getattr(in_feet, name)[:2] for name in names})
+    found = adjusted(survey, two, nowhere, **small)
+    assert found.bars.is_unclear.all() and not found.bars.is_used.any()
+    said = sentences(sfm.bar_findings(two, found.bars, found.block))
+    assert len(said) == 1 and "contradict each other" in said[0] and "the block has no scale" in said[0]
+
+
+def test_a_fit_to_control_is_compared_with_the_bars_where_it_leaves_the_block(
+    survey: Simulated, ends: Control, held: sfm.Adjusted
+) -> None:
+    bars = bars_of(ends)
+    fit = sfm.compared_bars(held.block, lambda xyz_m: 1.01 * xyz_m, bars, ends)
+    np.testing.assert_allclose(fit.residual_m, 0.01 * bars.length_m, atol=0.05)
+    assert (fit.over_sigma > 3.29).all() and not fit.is_used.any()
+    said = sentences(sfm.bar_findings(bars, fit, held.block))
+    assert len(said) == 3 and all("It took no part." in text for text in said)
 
 
 def test_ends_that_too_few_photos_show_are_told(survey: Simulated, ends: Control) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxba._errors import JaxbaError
 from jaxba.ba._problem import AbstractPrior, Problem
 from jaxba.ba.checks._plausible import implausible_cameras
-from jaxba.geometry import check_loss
+from jaxba.geometry import Linear, check_loss
 
 _QUATERNION_NORM = 1e-3  # files round quaternions to a few digits; more than this is a mistake
 
@@ -245,7 +245,7 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
             )
         label = lambda row: of_kind(int(index[row]))  # noqa: E731
     if prior.name == "scale_bar":
-        _check_bars(problem, values)
+        _check_bars(problem, prior, values)
     if prior.name == "position_offset" and not indices:
         every = np.arange(sizes["rows"])
         _check_index(problem, f"prior {prior.name}: rows", every, "rows", "offsets", sizes)
@@ -266,7 +266,12 @@ def _check_prior(problem: Problem, prior: AbstractPrior, sizes: Mapping[str, int
             _check_finite(f"{name} (any number where the sigma is infinite)", value, label)
 
 
-def _check_bars(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
+def _check_bars(problem: Problem, prior: AbstractPrior, values: Mapping[str, np.ndarray]) -> None:
+    if not isinstance(prior.loss, Linear):
+        raise JaxbaError(
+            f"prior scale_bar: loss {type(prior.loss).__name__}; it is to be Linear: two rows share what a bar is off, "
+            "and a robust loss would judge each by its part. Test bars by statistics, and leave out a wrong one."
+        )
     ends, offsets = values["offset_index"], _length(problem.position_offset)
     in_pairs = len(ends) % 2 == 0 and np.array_equal(values["end_index"], np.arange(len(ends)) % 2)
     are_last = np.array_equal(ends, np.arange(offsets - len(ends), offsets))

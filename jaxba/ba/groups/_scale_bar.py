@@ -28,7 +28,7 @@ class ScaleBarPrior(AbstractPrior):
     - `offset_index`: the end, a row of the problem's `position_offset`; a bar's second end is the one after its first.
     - `end_index`: 0 for a first end, 1 for a second one. `point_index`: the point that the end stands at.
     - `xyz`, `other_xyz`: what this end and the bar's other one are counted from, metres, world.
-    - `length_m`, `std_m`: length of the bar and its sigma, the same in both rows.
+    - `length_m`, `std_m`: length of the bar and its sigma, the same in both rows. `loss`: none but least squares.
     """
 
     name: ClassVar[str] = "scale_bar"

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 import jaxba
 
 
-@pytest.mark.parametrize("num_images", [100, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("num_images", [100, pytest.param(250, marks=pytest.mark.slow)])
 def test_block_is_recovered_as_the_covariance_predicts(num_images: int) -> None:
     survey = jaxba.synthetic.uav_block(num_images, seed=0, outlier_fraction=0.02, num_check=30)
     truth, loss = survey.truth, jaxba.Huber(1.0)

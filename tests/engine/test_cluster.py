@@ -192,7 +192,7 @@ def test_tiles_whose_scheduler_goes_are_named(tmp_path: Path, monkeypatch: pytes
             crew(resources, ()) as found,
         ):
             assert found is not None
-            monkeypatch.setattr(_cluster, "_PATIENCE_S", 3.0)
+            monkeypatch.setattr(_cluster, "_PATIENCE_S", 10.0)
             jaxba.solve_tiled(problem, num_tiles=4, executors=found.executors, folder=tmp_path, on_tile=go)
 
 

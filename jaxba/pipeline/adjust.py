@@ -177,7 +177,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         tiling,
         inputs.bars,
     )
-    sigmas = sfm.uncertainty(adjusted, reference)
+    sigmas = sfm.uncertainty(adjusted, reference, with_statistics=True)
     judged = sigmas.statistics
     flights = sfm.flight_offsets(adjusted, sigmas, reference)
     control = dataclasses.replace(inputs.control, mark_std_px=adjusted.mark_std_px)

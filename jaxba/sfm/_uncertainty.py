@@ -18,13 +18,14 @@ of a block in which only tracks are independent of each other.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import digamma, polygamma
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import Covariance, Statistics, statistics
+from jaxba.ba import Covariance, Statistics, covariance, statistics
 from jaxba.scene import Block, Reference
 from jaxba.sfm._adjust import Adjusted
 from jaxba.sfm._cores import on_all_cores
@@ -44,7 +45,7 @@ class Uncertainty:
 
     - `position_std_m`, `point_std_m`: world. `intrinsics_std`: in the parameters' units, 0 for what is fixed.
     - `variance_factor`: of the residuals, by the sigmas that weighed observations, tails aside; NaN likewise.
-    - `statistics`: of the problem with the sigmas that its errors show.
+    - `covariance`, `statistics`: of the problem with the sigmas that its errors show; the latter where asked for.
     """
 
     position_std_m: Float[np.ndarray, "images 3"]
@@ -52,26 +53,28 @@ class Uncertainty:
     intrinsics_std: Float[np.ndarray, "cameras parameters"]
     variance_factor: float
     why_not: str | None = None
+    covariance: Covariance | None = None
     statistics: Statistics | None = None
 
-    @property
-    def covariance(self) -> Covariance | None:
-        return None if self.statistics is None else self.statistics.covariance
 
+def uncertainty(adjusted: Adjusted, reference: Reference, *, with_statistics: bool = False) -> Uncertainty:
+    """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured.
 
-def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
-    """Return the sigmas of an adjusted block; NaN along an axis in which no position is measured."""
+    - `with_statistics`: also those of every measurement, which compile for some seconds more.
+    """
     block = adjusted.block
     position, point = np.full((block.num_images, 3), np.nan), np.full((block.num_points, 3), np.nan)
     times = adjusted.spread
     problem = weighed(adjusted.problem, times, block.num_observations)
     loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
-        of_all = statistics(problem, loss=loss, independent="tracks", max_memory=adjusted.max_memory)
+        room: dict[str, Any] = {"independent": "tracks", "max_memory": adjusted.max_memory}
+        of_all = statistics(problem, loss=loss, **room) if with_statistics else None
+        found = covariance(problem, loss=loss, **room) if of_all is None else of_all.covariance
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")
-    found, why_not = of_all.covariance, None
+    why_not = None
     if block.is_georeferenced:
         position = _std(found.centers)
         variance = np.maximum(np.einsum("nii->ni", found.points[: block.num_points]), 0.0)
@@ -87,7 +90,7 @@ def uncertainty(adjusted: Adjusted, reference: Reference) -> Uncertainty:
             "no scale to give them in. Add GNSS positions or ground control."
         )
     factor = found.variance_factor * times**2  # positions' part of the cost is small
-    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, of_all)
+    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found, of_all)
 
 
 def with_own_errors(

@@ -11,7 +11,7 @@ from jaxba.report import bar_facts, bar_rows, sentences
 from jaxba.scene import BarFit, Block, Control, Reference, ScaleBars
 from jaxba.simulation.staged import Simulated, measured_anew, simulate, spread_control
 
-SETTINGS = sfm.Settings(max_rounds=3)
+SETTINGS = sfm.Settings(max_rounds=2)
 STD_M = 0.003
 
 

@@ -82,8 +82,7 @@ def row_statistics(
     test = np.where(checked, error / np.sqrt(variance), np.nan)
     detectable = np.where(used, np.where(checked, NONCENTRALITY * np.sqrt(variance), np.inf), np.nan)
     moved = np.linalg.norm(reach, axis=1) * weight[:, None]
-    still = np.where(used & (moved == 0), 0.0, np.nan)
-    reach_m = np.where(moved > 0, np.where(moved > 0, detectable, 0.0) * moved, still)  # of infinity and 0 none
+    reach_m = np.where(moved > 0, detectable, 0.0) * np.where(used, moved, np.nan)  # what moves nothing may be infinite
 
     # along the eigenvectors of the leverage components are independent; two rays of a point check one direction alone
     spread, turn = np.linalg.eigh(np.where(used[:, :, None] & used[:, None], leverage, 0.0))

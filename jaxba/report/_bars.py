@@ -37,16 +37,20 @@ def bar_facts(bars: ScaleBars, fit: BarFit | None = None) -> list[dict[str, Any]
 
 
 def bar_rows(facts: Facts | None) -> list[tuple[str, str]]:
-    """Return the rows of the summary in the terminal: RMS of the bars that took part and of the others."""
+    """Return the rows of the summary in the terminal: RMS of the bars that took part, and of the others."""
     rows = []
-    for said, mine in (("used", True), ("compared alone", False)):
-        found = [bar for bar in facts or () if bar["used"] == mine and _is_known(bar["residual_m"])]
+    for said in ("used", "set aside", "compared alone"):
+        found = [bar for bar in facts or () if _became(bar) == said and _is_known(bar["residual_m"])]
         if found:
             rms = math.sqrt(sum(bar["residual_m"] ** 2 for bar in found) / len(found))
             worst = max(found, key=lambda bar: abs(bar["residual_m"]))
             off = f"worst {worst['first']}-{worst['second']} by {worst['residual_m']:+.4f} m"
             rows.append(("scale bars", f"RMS {rms:.4f} m over {many(len(found), 'bar')} {said}; {off}"))
     return rows
+
+
+def _became(bar: dict[str, Any]) -> str:
+    return "used" if bar["used"] else "set aside" if bar["set_aside"] else "compared alone"
 
 
 def _is_known(value: float | None) -> bool:
@@ -80,6 +84,13 @@ def _contradict_each_other(names: Sequence[str], has_scale: bool) -> str:
     )
 
 
+def _not_tested(names: Sequence[str]) -> str:
+    return (
+        f"Scale bars {some(list(names))} hold the block and were not tested against it, since sigmas could not be "
+        "computed; compare their lengths by other means, or mend what the sigmas lack."
+    )
+
+
 def _scale(count: int) -> str:
     return f"{many(count, 'scale bar')} told the scale of a block that has no place on earth: it is in metres."
 
@@ -88,5 +99,6 @@ BAR_WORDS: dict[str, Callable[..., str]] = {
     "scale bars without ends": _without_ends,
     "scale bar contradicts": _contradicts,
     "scale bars contradict each other": _contradict_each_other,
+    "scale bars not tested": _not_tested,
     "scale by bars": _scale,
 }

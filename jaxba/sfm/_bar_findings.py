@@ -12,6 +12,9 @@ def bar_findings(bars: ScaleBars, fit: BarFit, block: Block) -> tuple[Finding, .
     lost = np.flatnonzero(~np.isfinite(fit.distance_m))
     if len(lost):
         found.append(Finding.of("scale bars without ends", names=[bars.names[k] for k in lost]))
+    untested = np.flatnonzero(fit.is_used & np.isnan(fit.distance_std_m))
+    if len(untested):
+        found.append(Finding.of("scale bars not tested", names=[bars.names[k] for k in untested]))
     with np.errstate(invalid="ignore"):
         is_off = fit.is_set_aside | (~fit.is_used & (np.abs(fit.over_sigma) > OUTLIER))
     has_scale = block.is_georeferenced or bool(fit.is_used.any())

@@ -68,20 +68,19 @@ def onto_bars(
     aside, unclear = _tested(seen, bars, use, is_free=is_free)
     use &= ~aside
     factor = 1.0
-    while use.any():
-        now = given.ends(solved.block).distance_m[use]
-        grow = float(np.median(bars.length_m[use] / now)) if is_free else 1.0
-        factor *= grow
-        solved = solve(transformed(solved.block, scaling(grow)), use, factor)
-        over = np.where(use, np.nan_to_num(np.abs(_fit(solved, given, use, aside, unclear).over_sigma)), 0.0)
+    while True:
+        if use.any() and is_free:
+            now = given.ends(solved.block).distance_m[use]
+            grow = float(np.median(bars.length_m[use] / now))
+            factor, solved = factor * grow, dataclasses.replace(solved, block=transformed(solved.block, scaling(grow)))
+        if use.any() or solved.problem.num_bar_ends:  # else no bar holds the block, nor did one
+            solved = solve(solved.block, use, factor)
+        fit = _fit(solved, given, use, aside, unclear)
+        over = np.where(use, np.nan_to_num(np.abs(fit.over_sigma)), 0.0)
         worst = int(np.argmax(over))
         if over[worst] <= OUTLIER:
-            break
+            return solved, fit
         use[worst], aside[worst] = False, True
-    else:
-        if factor != 1.0 or solved.problem.num_bar_ends:  # the last of them let go
-            solved = solve(solved.block, use, factor)
-    return solved, _fit(solved, given, use, aside, unclear)
 
 
 def scaling(factor: float) -> Similarity:

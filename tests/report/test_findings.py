@@ -52,6 +52,11 @@ CASES = [
         "Check their lengths, units and marks.",
     ),
     (
+        Finding.of("scale bars not tested", names=["a-b"]),
+        "Scale bars a-b hold the block and were not tested against it, since sigmas could not be computed; compare "
+        "their lengths by other means, or mend what the sigmas lack.",
+    ),
+    (
         Finding.of("scale by bars", count=1),
         "1 scale bar told the scale of a block that has no place on earth: it is in metres.",
     ),

@@ -51,6 +51,19 @@ def adjusted(survey: Simulated, bars: ScaleBars, reference: Reference | None = N
     return sfm.adjust(block, survey.tracks, survey.view_graph, reference, survey.photos, SETTINGS, bars=bars)
 
 
+def adjusted_without_a_place(survey: Simulated, bars: ScaleBars) -> sfm.Adjusted:
+    """Adjust the survey as photos alone have it, at a fortieth of its size."""
+    nowhere = dataclasses.replace(
+        survey.reference,
+        xyz_m=np.full((12, 3), np.nan),
+        std_m=np.full((12, 3), np.nan),
+        is_used=np.zeros(12, bool),
+        quaternion=np.full((12, 4), np.nan),
+    )
+    small = {"translation_m": survey.block.translation_m / 40.0, "is_georeferenced": False}
+    return adjusted(survey, bars, nowhere, **small)
+
+
 def scale_error(survey: Simulated, block: Block) -> float:
     onto = umeyama(block.points_m, np.asarray(survey.survey.truth.points)[block.track_index])
     assert onto is not None
@@ -104,6 +117,13 @@ def test_a_single_bar_is_tested_before_it_may_pull(survey: Simulated, ends: Cont
     assert found.bars.is_set_aside.all() and not found.bars.is_unclear.any()
     assert abs(scale_error(survey, found.block)) < 0.05  # as positions have it
     assert len(sfm.bar_findings(one, found.bars, found.block)) == 1
+    assert "1 bar set aside" in bar_rows(bar_facts(one, found.bars))[0][1]
+
+
+def test_bars_that_pull_untested_are_told(survey: Simulated, ends: Control, held: sfm.Adjusted) -> None:
+    without = dataclasses.replace(held.bars, distance_std_m=np.full(3, np.nan), over_sigma=np.full(3, np.nan))
+    said = sentences(sfm.bar_findings(bars_of(ends), without, held.block))
+    assert len(said) == 1 and "gcp04-gcp05 hold the block and were not tested" in said[0]
 
 
 def test_a_bar_at_a_check_point_is_compared_alone(survey: Simulated, ends: Control) -> None:
@@ -119,43 +139,27 @@ def test_a_bar_at_a_check_point_is_compared_alone(survey: Simulated, ends: Contr
 
 
 def test_a_block_without_a_place_takes_the_scale_of_its_bars(survey: Simulated, ends: Control) -> None:
-    nowhere = dataclasses.replace(
-        survey.reference,
-        xyz_m=np.full((12, 3), np.nan),
-        std_m=np.full((12, 3), np.nan),
-        is_used=np.zeros(12, bool),
-        quaternion=np.full((12, 4), np.nan),
-    )
-    small = {"translation_m": survey.block.translation_m / 40.0, "is_georeferenced": False}
     bars = bars_of(ends)
-    found = adjusted(survey, bars, nowhere, **small)
+    found = adjusted_without_a_place(survey, bars)
     assert found.bars.is_used.all() and abs(scale_error(survey, found.block)) < 2e-4
     assert (np.abs(found.bars.residual_m) < 5 * STD_M).all()
     said = sentences(sfm.bar_findings(bars, found.bars, found.block))
     assert said == ["3 scale bars told the scale of a block that has no place on earth: it is in metres."]
-    bare = adjusted(survey, ScaleBars.nothing(), nowhere, **small)
+    bare = adjusted_without_a_place(survey, ScaleBars.nothing())
     assert scale_error(survey, bare.block) < -0.9
 
 
 def test_two_bars_against_each_other_tell_no_scale_and_three_tell_which_is_wrong(
     survey: Simulated, ends: Control
 ) -> None:
-    nowhere = dataclasses.replace(
-        survey.reference,
-        xyz_m=np.full((12, 3), np.nan),
-        std_m=np.full((12, 3), np.nan),
-        is_used=np.zeros(12, bool),
-        quaternion=np.full((12, 4), np.nan),
-    )
-    small = {"translation_m": survey.block.translation_m / 40.0, "is_georeferenced": False}
     bars = bars_of(ends)
     in_feet = dataclasses.replace(bars, length_m=bars.length_m * [1.0, 3.28, 1.0])
-    found = adjusted(survey, in_feet, nowhere, **small)
+    found = adjusted_without_a_place(survey, in_feet)
     assert found.bars.is_set_aside.tolist() == [False, True, False]
     assert abs(scale_error(survey, found.block)) < 2e-4
     names = ("first", "second", "length_m", "std_m", "is_check")
     two = dataclasses.replace(in_feet, **{name: getattr(in_feet, name)[:2] for name in names})
-    found = adjusted(survey, two, nowhere, **small)
+    found = adjusted_without_a_place(survey, two)
     assert found.bars.is_unclear.all() and not found.bars.is_used.any()
     said = sentences(sfm.bar_findings(two, found.bars, found.block))
     assert len(said) == 1 and "contradict each other" in said[0] and "the block has no scale" in said[0]

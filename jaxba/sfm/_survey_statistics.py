@@ -44,7 +44,8 @@ def _kind(one: VarianceComponent, taken_std: float) -> MeasuredKind:
 def _taken(adjusted: Adjusted, reference: Reference, control: Control) -> dict[str, float]:
     """Return the kinds that were measured, and the median of the sigmas that they were taken to have, or NaN."""
     nan = float("nan")
-    taken = {"tie points": nan, "marks": nan if control.mark_std_is_assumed else control.mark_std_px}
+    says = control.num_points > 0 and not control.mark_std_is_assumed
+    taken = {"tie points": nan, "marks": control.mark_std_px if says else nan}
     if adjusted.block.is_georeferenced:
         taken |= _of_reference(adjusted.block, reference)
     if adjusted.control is not None:

@@ -138,6 +138,8 @@ def test_scale_bars_take_part_and_reach_the_summary_and_the_files(survey: Survey
     assert wrong["set_aside"] and wrong["residual_m"] == pytest.approx(-0.5, abs=0.05)
     assert any(text.startswith("Scale bar gcp02-gcp03 contradicts") for text in run.facts["adjust"]["findings"])
     assert "control" not in run.facts
+    kinds = {kind["name"]: kind for kind in run.facts["adjust"]["statistics"]["kinds"]}
+    assert kinds["marks"]["taken_std"] is None  # nobody states it
     with open(own.project / "export" / "bars.csv", encoding="utf-8", newline="") as file:
         assert [row["used"] for row in csv.DictReader(file)] == ["yes", "no"]
     problem = read_tile(own.project / "export" / "tile.npz")

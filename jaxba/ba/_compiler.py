@@ -12,6 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxba.ba._kept_programs import program
+
 _FAST = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 
 
@@ -61,7 +63,7 @@ def _ahead(
     function: Callable[..., Any], structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...], _: str
 ) -> Callable[..., Any]:
     arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
-    return jax.jit(function).lower(*arguments).compile(compiler_options=compiler_options())
+    return program(function, arguments, compiler_options(), made_from=function).compiled()
 
 
 def platform() -> str:

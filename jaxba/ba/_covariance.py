@@ -214,7 +214,7 @@ def _in_order(
     free_intrinsics = np.asarray(free.intrinsics)
     shared_free = np.zeros(0, bool) if shape.own_cameras else free_intrinsics[:, refined].reshape(-1)
     border_free = np.append(shared_free, problem.free_antenna[: shape.antenna])
-    of_border = found.border if found.tracks is None else found.border + found.tracks.by_tracks()
+    of_border = found.border if found.tracks is None else found.border + found.tracks.by_tracks(found.border)
     border = of_border * np.outer(border_free, border_free)
     offsets, num_antenna = len(problem.position_offset) - problem.num_bar_ends, 0
     if shape.antenna:

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from jaxba._errors import JaxbaError
 from jaxba._sizes import free_memory, size_text
 from jaxba.ba._compiler import compiler_options, platform
+from jaxba.ba._kept_programs import program
 from jaxba.ba._linearise import cost
 from jaxba.ba._solution import HistoryStep
 from jaxba.ba._solvers import RUNNING, AbstractSchurSolver, State, take_numbers
@@ -152,17 +153,13 @@ def _compile(
     def plain_cost(system: System, unknowns: Unknowns) -> Float[Array, ""]:
         return cost(system, unknowns)
 
-    state = eqx.filter_eval_shape(init, numbers, unknowns, system)
-    lowered = (
-        jax.jit(step).lower(numbers, unknowns, state, system),
-        jax.jit(init).lower(numbers, unknowns, system),
-        jax.jit(plain_cost).lower(plain, unknowns),
-    )
     # the steps of a large program run long enough to pay for the optimisations
     small = sum(math.prod(shape) for shape, _ in shapes) < _SMALL
-    options = compiler_options() if small else {}
+    made = functools.partial(program, options=compiler_options() if small else {}, made_from=rest)
+    start = made(init, (numbers, unknowns, system))
+    programs = made(step, (numbers, unknowns, start.result, system)), start, made(plain_cost, (plain, unknowns))
     with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
-        of_step, of_init, of_cost = pool.map(lambda one: one.compile(compiler_options=options), lowered)
+        of_step, of_init, of_cost = pool.map(lambda one: one.compiled(), programs)
     found = of_step.memory_analysis()
     step_bytes = 0.0 if found is None else float(found.temp_size_in_bytes + found.output_size_in_bytes)
     return Compiled(init=of_init, step=of_step, cost=of_cost, step_bytes=step_bytes)

@@ -9,6 +9,12 @@ unknowns, A = sum over observations of k k^T, becomes
 with J and r as the loss weighs them, C the covariances of the shared unknowns with what an observation depends on, and
 f = sum r^2 / sum (2 n - 3) over tracks of n views (2 n of a fixed point): M is A where all errors are alike, however
 large. As C N = 1, the scores u of a track hold nothing of its own point, whose freedom its residuals lack.
+
+M is a sum of squares and errs. What is added to the covariance is therefore not M - A but the share of it that is no
+chance (Ledoit and Wolf 2004, toward A), with the sizes of matrices measured by the covariance C of the shared unknowns,
+|X|^2 = tr(C^-1 X C^-1 X):
+
+    1 - b^2 / |M - A|^2,    b^2 = sum over tracks of |u u^T / f|^2 - |M|^2 / tracks
 """
 
 from typing import NamedTuple
@@ -30,19 +36,41 @@ from jaxba.ba.groups import Reprojection
 class TrackSums(NamedTuple):
     """Sums over the tracks of a tile, or of all.
 
-    - `scores`: of u u^T. `alike`: A. `squared`: of r^2. `freedom`: of 2 n - 3.
+    - `scores`: of u u^T. `fourth`: of |u u^T|^2. `alike`: A. `squared`: of r^2. `freedom`: of 2 n - 3. `tracks`: of 1.
     """
 
     scores: Float[Array | np.ndarray, "border border"]
+    fourth: Float[Array | np.ndarray, ""]
     alike: Float[Array | np.ndarray, "border border"]
     squared: Float[Array | np.ndarray, ""]
     freedom: Float[Array | np.ndarray, ""]
+    tracks: Float[Array | np.ndarray, ""]
 
-    def by_tracks(self) -> Float[np.ndarray, "border border"]:
-        """Return what is to be added to the covariance of the shared unknowns."""
+    def by_tracks(self, corner: Float[np.ndarray, "border border"]) -> Float[np.ndarray, "border border"]:
+        """Return what is to be added to the covariance of the shared unknowns, which is `corner`."""
+        alike = np.asarray(self.alike)
         if not (self.freedom > 0 and self.squared > 0):
-            return np.zeros(self.alike.shape)
-        return np.asarray(self.scores) * float(self.freedom / self.squared) - np.asarray(self.alike)
+            return np.zeros(alike.shape)
+        factor = float(self.freedom / self.squared)
+        found = factor * np.asarray(self.scores)
+        unit, inverse = (np.asarray(part) for part in _unit_and_inverse(jnp.asarray(corner)))
+
+        def square(matrix: Float[np.ndarray, "border border"]) -> float:
+            product = inverse @ (matrix / np.outer(unit, unit))
+            return float(np.sum(product * product.T))
+
+        chance = factor**2 * float(self.fourth) - square(found) / float(self.tracks)
+        more, all_of_it = found - alike, square(found - alike)
+        return more * max(1 - chance / all_of_it, 0.0) if all_of_it > 0 else np.zeros(alike.shape)
+
+
+def _unit_and_inverse(
+    corner: Float[Array, "border border"],
+) -> tuple[Float[Array, " border"], Float[Array, "border border"]]:
+    """Return the sigmas of the shared unknowns and the inverse of their correlations; what is fixed has zeros in it."""
+    variance = jnp.diagonal(corner)
+    unit = jnp.where(variance > 0, jnp.sqrt(jnp.abs(variance)), 1.0)
+    return unit, jnp.linalg.pinv(corner / jnp.outer(unit, unit), hermitian=True)
 
 
 def track_sums(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint: Joint) -> TrackSums:
@@ -76,6 +104,7 @@ def track_sums(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint
             squared + jnp.sum(residual**2),
         ), ()
 
+    unit, of_correlations = _unit_and_inverse(corner)
     dtype = unknowns.points.dtype
     start = (
         jnp.zeros((shape.num_points, shape.border), dtype),
@@ -85,4 +114,7 @@ def track_sums(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint
     )
     (scores, views, alike, squared), _ = scan_chunks(system, body, start)
     freedom = jnp.sum(jnp.maximum(2 * views - 3 * jnp.asarray(system.free.points)[:, 0], 0.0))
-    return TrackSums(scores.T @ scores, alike, squared, freedom)
+    scaled = scores / unit
+    fourth = jnp.sum(jnp.sum((scaled @ of_correlations) * scaled, axis=1) ** 2)
+    tracks = jnp.sum(views > 0).astype(dtype)
+    return TrackSums(scores.T @ scores, fourth, alike, squared, freedom, tracks)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxba
-from jaxba.ba import _descend, _products
+from jaxba.ba import _descend, _kept_programs, _products
 from jaxba.ba._compiler import compiler_options, fast_jit, platform
 
 
@@ -29,6 +29,7 @@ def test_the_products_for_a_gpu_lead_to_the_same_steps(monkeypatch: pytest.Monke
     here = jaxba.solve(problem, max_nfev=3)
     products, einsum = [], jnp.einsum
     monkeypatch.setattr(jnp, "einsum", lambda form, *of: products.append(form) or einsum(form, *of))
+    monkeypatch.setattr(_kept_programs, "_folder", lambda: None)
     monkeypatch.setattr(_products, "platform", lambda: "gpu")
     monkeypatch.setattr(_descend, "platform", lambda: "gpu")
     there = jaxba.solve(problem, max_nfev=3)

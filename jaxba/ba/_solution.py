@@ -9,9 +9,11 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxba._errors import JaxbaError
 from jaxba.ba._factor import CG_MAX_STEPS
 from jaxba.ba._problem import Problem
 from jaxba.ba._solvers import FTOL, GTOL, NOT_FINITE, RUNNING, STUCK, XTOL
+from jaxba.ba._tables import DataFrame, control_table, images_table, observations_table, pairs_table, points_table
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.checks import Dropped, free_gauge, implausible_cameras
 from jaxba.geometry import AbstractCamera, Pose
@@ -182,6 +184,35 @@ class Solution(eqx.Module):
         Empty for a solve inside `jit`, `vmap` or a derivative.
         """
         return [] if self.report is None else implausible_cameras(self.apply(self.report.problem), few=0.0)
+
+    def observations_frame(self) -> DataFrame:
+        """Return the table of observations: pixels, sigmas and residuals. Columns of all tables: `ba/_tables.py`."""
+        return observations_table(self._adjusted("observations_frame"), None)
+
+    def images_frame(self) -> DataFrame:
+        """Return the table of images; with sigmas it is that of `jaxba.statistics`."""
+        return images_table(self._adjusted("images_frame"), None)
+
+    def points_frame(self) -> DataFrame:
+        """Return the table of points; with sigmas it is that of `jaxba.statistics`."""
+        return points_table(self._adjusted("points_frame"), None)
+
+    def control_frame(self) -> DataFrame:
+        """Return the table of control points: sigmas, and adjusted minus surveyed; NaN of what was not surveyed."""
+        return control_table(self._adjusted("control_frame"))
+
+    def pairs_frame(self) -> DataFrame:
+        """Return the table of pairs of images that have points in common."""
+        return pairs_table(self._adjusted("pairs_frame"))
+
+    def _adjusted(self, asks: str) -> Problem:
+        """Return what was solved, with the solution's values."""
+        if self.report is None:
+            raise JaxbaError(
+                f"{asks}: a solution from inside jit, vmap or a derivative does not hold its problem; take the tables "
+                "of jaxba.statistics(solution.apply(problem))."
+            )
+        return self.apply(self.report.problem)
 
     def apply(self, problem: Problem) -> Problem:
         """Return the problem with the solution's values as start values."""

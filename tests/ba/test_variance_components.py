@@ -119,6 +119,17 @@ def test_tables_hold_a_row_for_each_measurement() -> None:
     across = along[:, ::-1] * [1, -1]
     again = np.einsum("n,ni,nj->nij", a**2, along, along) + np.einsum("n,ni,nj->nij", b**2, across, across)
     np.testing.assert_allclose(again, found.covariance.centers[:, :2, :2], rtol=1e-6, atol=1e-12)
+    # those of the solution alone are the same, without what needs sigmas
+    solution = jaxba.solve(problem)
+    alike = {"observations": seen, "images": images, "points": points, "control": control, "pairs": pairs}
+    for name, table in alike.items():
+        alone = getattr(solution, f"{name}_frame")()
+        columns = [column for column in table.columns if column in alone.columns]
+        assert len(columns) == len(alone.columns) and len(alone) == len(table), name
+        numbers = table[columns].to_numpy(float), alone.to_numpy(float)
+        np.testing.assert_allclose(*numbers, rtol=1e-6, atol=1e-6, err_msg=name)
+    with pytest.raises(JaxbaError, match=r"images_frame: a solution from inside jit"):
+        dataclasses.replace(solution, report=None).images_frame()
     with pytest.raises(JaxbaError, match="no prior 'attitude'; it has position, control"):
         found.prior_frame("attitude")
 

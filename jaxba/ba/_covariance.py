@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._inner_constraints import free_block, of_photos_alone
+from jaxba.ba._inner_constraints import free_block, num_free, of_photos_alone
 from jaxba.ba._leverage import Leverage
 from jaxba.ba._plan_shape import PlanShape, bare_shape
 from jaxba.ba._problem import Problem
@@ -87,7 +87,7 @@ def covariance(
 
     - `loss`: as given to `solve`; rows count with the weight that it gives them (least squares if None).
     - `datum`: what the block's place, rotation and scale are known from: `priors`, with what is held fixed, or `inner`
-      for photos alone, under inner constraints over the points, whatever priors say.
+      for photos and scale bars alone, under inner constraints over the points, whatever other priors say.
     - `independent`: of which errors are: `observations`, or only `tracks`, some of which are measured worse than others
       in all their images. That tells in `border`, intrinsics that images share, lever arm and position offsets
       (`_track_scores.py`).
@@ -149,7 +149,7 @@ def marginals_at(
     of_datum = _of_priors if datum == "priors" else _of_photos
     found = of_datum(label, prepared.problem, loss, rows, independent == "tracks", **room)
     losses = [loss, *(prior.loss for prior in problem.priors)]
-    defect = 0 if datum == "priors" else 7
+    defect = 0 if datum == "priors" else num_free(problem)
     of_all = _in_order(found, losses, prepared.problem, prepared.dropped, defect)
     return At(problem, of_all, found.leverages, prepared.kept)
 

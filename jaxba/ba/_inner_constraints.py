@@ -1,4 +1,4 @@
-"""The datum of inner constraints: what photos alone know of a block, placed where its points' sigmas are smallest.
+"""The datum of inner constraints: what a block knows of its shape, placed where its points' sigmas are smallest.
 
 Photos leave seven directions D of a block free (Triggs et al. 2000, section 9): N D = 0. Of all ways to fix these,
 inner constraints over the points, `sum D_i^T dx_i = 0`, give the covariance C of the smallest trace over them (Meissl
@@ -7,7 +7,7 @@ the block held in any other way by S-transformation (Baarda 1973),
 
     C = P Q P^T,   P = I - D D^T W
 
-and from that of seven coordinates of three points, which bend nothing.
+and from that of seven coordinates of three points, which bend nothing. Where scale bars hold the scale, it is six.
 """
 
 import dataclasses
@@ -20,29 +20,29 @@ from jaxba._errors import JaxbaError
 from jaxba.ba._problem import Problem
 from jaxba.ba._unknowns import Step
 from jaxba.ba.checks import free_directions
-from jaxba.ba.groups import ControlPointPrior
+from jaxba.ba.groups import ControlPointPrior, ScaleBarPrior
 
 _LEAST_POINTS = 10
 _HELD = 1e-3  # sigma of the seven coordinates over the block's rms extent; the result does not depend on it
 
 
 class FreeBlock(NamedTuple):
-    """A block of which only photos tell.
+    """A block of which only photos and scale bars tell.
 
-    - `held`: the same with seven coordinates held by a prior, the last of its priors.
+    - `held`: the same with as many coordinates held by a prior as directions are free, the last of its priors.
     - `poses`, `points`: D over both.
     """
 
     held: Problem
-    poses: Float[np.ndarray, "images 6 7"]
-    points: Float[np.ndarray, "points 3 7"]
+    poses: Float[np.ndarray, "images 6 free"]
+    points: Float[np.ndarray, "points 3 free"]
 
     def columns(self) -> list[Step]:
         """Return W D as right-hand sides."""
         problem = self.held
         poses, intrinsics = np.zeros((problem.num_images, 6)), np.zeros(problem.free.intrinsics.shape)
         antenna = np.zeros(problem.antenna.shape)
-        return [Step(poses, intrinsics, antenna, np.array(self.points[:, :, k])) for k in range(7)]
+        return [Step(poses, intrinsics, antenna, np.array(self.points[:, :, k])) for k in range(self.points.shape[2])]
 
     def transformed(
         self, poses: np.ndarray, points: np.ndarray, solutions: list[Step]
@@ -60,10 +60,15 @@ class FreeBlock(NamedTuple):
         return of_kind(poses, self.poses, across_poses), of_kind(points, self.points, across_points)
 
 
-def of_photos_alone(label: str, problem: Problem) -> Problem:
-    """Return a problem without the priors of poses and points.
+def num_free(problem: Problem) -> int:
+    """Return how many directions nothing holds in a problem of photos and scale bars."""
+    return 6 if problem.num_bar_ends else 7
 
-    Lever arm and position offsets, of which nothing is known then, are held fixed.
+
+def of_photos_alone(label: str, problem: Problem) -> Problem:
+    """Return a problem without the priors of poses and points, its scale bars aside.
+
+    The lever arm, of which nothing is known then, is held fixed; position offsets are left out.
 
     Raises `JaxbaError` where poses or points are fixed.
     """
@@ -75,21 +80,23 @@ def of_photos_alone(label: str, problem: Problem) -> Problem:
                 f'{label}: datum "inner" is for a block that nothing holds, and {fixed} {kind} are fixed; free them, '
                 'or leave the datum at "priors".'
             )
-    held = np.array(False)
-    return dataclasses.replace(
-        problem,
-        priors=tuple(prior for prior in problem.priors if hasattr(prior, "camera_index")),
-        free=dataclasses.replace(free, lever_arm=held, position_offset=held),
-        position_offset=np.asarray(problem.position_offset)[: len(problem.position_offset) - problem.num_bar_ends],
-    )
+    bars, num_offsets = problem.prior("scale_bar"), len(problem.position_offset) - problem.num_bar_ends
+    priors = [prior for prior in problem.priors if hasattr(prior, "camera_index")]
+    if isinstance(bars, ScaleBarPrior):
+        priors.append(dataclasses.replace(bars, offset_index=np.asarray(bars.offset_index) - np.int32(num_offsets)))
+    free = dataclasses.replace(free, lever_arm=np.array(False), position_offset=np.array(bars is not None))
+    ends = np.asarray(problem.position_offset)[num_offsets:]
+    return dataclasses.replace(problem, priors=tuple(priors), free=free, position_offset=ends)
 
 
 def free_block(label: str, problem: Problem) -> FreeBlock:
-    """Return a problem of photos alone, that was checked, as inner constraints hold it.
+    """Return a problem of photos and scale bars, that was checked, as inner constraints hold it.
 
     Raises `JaxbaError` for a block of several parts.
     """
     poses, points, size = free_directions(label, problem)
+    count = num_free(problem)
+    poses, points = poses[:, :, :count], points[:, :, :count]  # the scale is the last one
     root = np.linalg.cholesky(np.einsum("nij,nik->jk", points, points))
     poses, points = (np.swapaxes(np.linalg.solve(root, np.swapaxes(d, 1, 2)), 1, 2) for d in (poses, points))
     xyz = np.asarray(problem.points, float)
@@ -101,7 +108,7 @@ def free_block(label: str, problem: Problem) -> FreeBlock:
             f'{len(seen)}. Leave the datum at "priors".'
         )
     std_m = np.full((3, 3), np.inf)
-    std_m.reshape(-1)[_best_rows(points[corners].reshape(9, 7))] = _HELD * size
+    std_m.reshape(-1)[_best_rows(points[corners].reshape(9, count))] = _HELD * size
     prior = ControlPointPrior(point_index=corners.astype(np.int32), xyz=xyz[corners], std_m=std_m)
     return FreeBlock(dataclasses.replace(problem, priors=(*problem.priors, prior)), poses, points)
 
@@ -119,10 +126,10 @@ def _corners(xyz: Float[np.ndarray, "points 3"], among: Int[np.ndarray, " n"]) -
     return among[[first, second, third]]
 
 
-def _best_rows(rows: Float[np.ndarray, "9 7"]) -> list[int]:
-    """Return seven rows that are as independent as can be had one by one."""
+def _best_rows(rows: Float[np.ndarray, "9 free"]) -> list[int]:
+    """Return as many rows as columns that are as independent as can be had one by one."""
     left, chosen = rows.copy(), []
-    for _ in range(7):
+    for _ in range(rows.shape[1]):
         chosen.append(int(np.argmax(np.sum(left**2, axis=1))))
         unit = left[chosen[-1]] / np.linalg.norm(left[chosen[-1]])
         left = left - np.outer(left @ unit, unit)

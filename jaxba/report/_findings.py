@@ -42,6 +42,13 @@ def is_to_act_on(finding: Finding) -> bool:
     return finding.kind not in _TO_KNOW
 
 
+def _of_the_shape() -> str:
+    return (
+        "The block has no place on earth: sigmas of positions and points say how well its shape is known, under inner "
+        "constraints over its points."
+    )
+
+
 def _note(text: str) -> str:
     return text
 
@@ -205,6 +212,7 @@ def _named(names: Sequence[str], figures: Sequence[str]) -> str:
 WORDS: dict[str, Callable[..., str]] = {
     "note": _note,
     "no sigmas": _note,
+    "sigmas of the shape": _of_the_shape,
     "not settled": _not_settled,
     "not converged": _not_converged,
     "large median": _large_median,

@@ -104,6 +104,7 @@ def findings(
         ("Intrinsics", lambda: _intrinsics(block, start, photos)),
         ("Sigmas of positions", lambda: _positions(block, sigmas, reference, photos, is_controlled)),
         ("Sigmas", lambda: [Finding.of("no sigmas", text=sigmas.why_not)] if sigmas.why_not else []),
+        ("Sigmas of the shape", lambda: [Finding.of("sigmas of the shape")] if sigmas.is_of_shape else []),
     )
     found: list[Finding] = []
     for what, find in parts:

@@ -15,6 +15,9 @@ that of a track with the sum S and d = 2n - 3 is then expected to be
 
 So a point of two images hardly speaks for itself, one of ten does. Intrinsics, which all tracks tell, have the sigmas
 of a block in which only tracks are independent of each other.
+
+**Without a place.** Where scale bars alone have told a block's scale, sigmas are those of its shape: under inner
+constraints over its points, for who fits the block onto something by six parameters.
 """
 
 import dataclasses
@@ -46,6 +49,7 @@ class Uncertainty:
     - `position_std_m`, `point_std_m`: world. `intrinsics_std`: in the parameters' units, 0 for what is fixed.
     - `variance_factor`: of the residuals, by the sigmas that weighed observations, tails aside; NaN likewise.
     - `covariance`, `statistics`: of the problem with the sigmas that its errors show; the latter where asked for.
+    - `is_of_shape`: those of positions and points are of the block's shape, which has no place.
     """
 
     position_std_m: Float[np.ndarray, "images 3"]
@@ -55,6 +59,7 @@ class Uncertainty:
     why_not: str | None = None
     covariance: Covariance | None = None
     statistics: Statistics | None = None
+    is_of_shape: bool = False
 
 
 def uncertainty(adjusted: Adjusted, reference: Reference, *, with_statistics: bool = False) -> Uncertainty:
@@ -74,23 +79,29 @@ def uncertainty(adjusted: Adjusted, reference: Reference, *, with_statistics: bo
     except JaxbaError as error:
         unknown = np.full(block.camera_parameters.shape, np.nan)
         return Uncertainty(position, point, unknown, np.nan, f"Sigmas were not computed. {error}")
-    why_not = None
-    if block.is_georeferenced:
+    why_not, is_of_shape = None, not block.is_georeferenced and bool(adjusted.bars.is_used.any())
+    if is_of_shape:
+        try:
+            found = covariance(problem, loss=loss, datum="inner", **room)
+        except JaxbaError as error:
+            is_of_shape, why_not = False, f"Sigmas of positions and points were not computed. {error}"
+    if block.is_georeferenced or is_of_shape:
         position = _std(found.centers)
         variance = np.maximum(np.einsum("nii->ni", found.points[: block.num_points]), 0.0)
         point = np.sqrt(with_own_errors(variance, block, adjusted.error_px, times * adjusted.std_px))
+    if block.is_georeferenced:
         index = block.image_index[used_positions(block, reference)]
         nowhere = ~np.isfinite(reference.std_m[index]).any(axis=0)
         if adjusted.control is not None:
             nowhere &= ~adjusted.control.determined
         position[:, nowhere], point[:, nowhere] = np.nan, np.nan
-    else:
+    elif not is_of_shape and why_not is None:
         why_not = (
             "Sigmas of positions and points were not computed: without measured positions the block has no place and "
             "no scale to give them in. Add GNSS positions or ground control."
         )
     factor = found.variance_factor * times**2  # positions' part of the cost is small
-    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found, of_all)
+    return Uncertainty(position, point, _std(found.intrinsics), factor, why_not, found, of_all, is_of_shape)
 
 
 def with_own_errors(

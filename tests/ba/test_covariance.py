@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from small_problems import one_of, two_flights
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import IntrinsicsPrior, Observations, Problem, Step, covariance, solve, statistics
+from jaxba.ba import Covariance, IntrinsicsPrior, Observations, Problem, Step, covariance, solve, statistics
 from jaxba.ba._unknowns import antenna_names
 from jaxba.geometry import AbstractLoss, Cauchy, Huber, Linear
 from jaxba.simulation import Survey, uav_block
@@ -176,36 +176,45 @@ def test_inner_constraints_are_those_of_a_dense_bordered_system(num_tiles: int):
     found = statistics(problem, datum="inner", max_observations=problem.num_observations / num_tiles)
     assert [prior.name for prior in found.problem.priors] == ["intrinsics"]
     dense = Dense(found.problem)
+    expected, jacobian = bordered_inverse(dense, found.problem, 7)
+    assert_inner(found.covariance, expected, found.problem)
+    leverage = np.einsum("ni,ij,nj->n", jacobian, expected, jacobian)
+    of_pixels = 1 - leverage[: 2 * problem.num_observations]
+    np.testing.assert_allclose(found.observations.redundancy.ravel(), of_pixels, rtol=0, atol=1e-8)
+    total = sum(np.nansum(rows.redundancy) for rows in (found.observations, *found.priors))
+    assert total == pytest.approx(found.covariance.redundancy, abs=1e-6)
+
+
+def bordered_inverse(dense: Dense, problem: Problem, num_free: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariance of all unknowns under inner constraints over the points, and the Jacobian."""
     jacobian = np.concatenate([group.jacobian.reshape(-1, dense.size) for group in dense.groups()])
     jacobian = jacobian[np.isfinite(jacobian).all(axis=1)]
     normal = jacobian.T @ jacobian
     unit = 1 / np.sqrt(np.diagonal(normal))
     values, vectors = np.linalg.eigh(normal * np.outer(unit, unit))
-    assert values[6] < 1e-10 * values[7]
-    directions = unit[:, None] * vectors[:, :7]
-    images, refined = problem.num_images, int(np.count_nonzero(problem.free.intrinsics))
-    poses = np.arange(6 * images).reshape(-1, 6)
-    intrinsics = 6 * images + np.arange(refined)
-    points = np.arange(6 * images + refined, dense.size).reshape(-1, 3)
+    assert values[num_free - 1] < 1e-9 * values[num_free]
+    directions = unit[:, None] * vectors[:, :num_free]
     over_points = np.zeros_like(directions)
-    over_points[points] = directions[points]
-    bordered = np.block([[normal, over_points], [over_points.T, np.zeros((7, 7))]])
+    of_points = slice(dense.size - 3 * problem.num_points, None)
+    over_points[of_points] = directions[of_points]
+    bordered = np.block([[normal, over_points], [over_points.T, np.zeros((num_free, num_free))]])
     scale = np.append(unit, 1 / np.linalg.norm(over_points, axis=0))
-    expected = np.linalg.inv(bordered * np.outer(scale, scale)) * np.outer(scale, scale)
+    inverse = np.linalg.inv(bordered * np.outer(scale, scale)) * np.outer(scale, scale)
+    return inverse[: dense.size, : dense.size], jacobian
+
+
+def assert_inner(found: Covariance, expected: np.ndarray, problem: Problem) -> None:
+    """Compare poses, points and intrinsics with those of a dense covariance."""
+    images, refined = problem.num_images, int(np.count_nonzero(problem.free.intrinsics))
     for of, index in (
-        (found.covariance.poses, poses),
-        (found.covariance.points, points),
-        (found.covariance.border[None], intrinsics[None]),
+        (found.poses, np.arange(6 * images).reshape(-1, 6)),
+        (found.points, np.arange(len(expected) - 3 * problem.num_points, len(expected)).reshape(-1, 3)),
+        (found.border[None], 6 * images + np.arange(refined)[None]),
     ):
         blocks = expected[index[:, :, None], index[:, None]]
         sigma = np.sqrt(np.einsum("nii->ni", blocks))
         unit = sigma[:, :, None] * sigma[:, None]
         np.testing.assert_allclose(of / unit, blocks / unit, rtol=0, atol=1e-8)
-    leverage = np.einsum("ni,ij,nj->n", jacobian, expected[: dense.size, : dense.size], jacobian)
-    of_pixels = 1 - leverage[: 2 * problem.num_observations]
-    np.testing.assert_allclose(found.observations.redundancy.ravel(), of_pixels, rtol=0, atol=1e-8)
-    total = sum(np.nansum(rows.redundancy) for rows in (found.observations, *found.priors))
-    assert total == pytest.approx(found.covariance.redundancy, abs=1e-6)
 
 
 def test_inner_constraints_are_refused_where_something_is_fixed():

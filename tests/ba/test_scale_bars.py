@@ -9,7 +9,7 @@ import pytest
 from dense_reference import Dense
 from jax import Array
 from small_problems import RADIAL, small_problem, with_bars
-from test_covariance import dense_covariance
+from test_covariance import assert_inner, bordered_inverse, calibrated, dense_covariance, small_block
 from test_statistics import dense_rows
 
 import jaxba
@@ -169,9 +169,20 @@ def test_rejection_leaves_an_end_the_two_observations_that_it_needs(without: Pro
     assert found.used[np.isin(kept, mine[:2])].all() and not found.used.all()
 
 
-def test_inner_constraints_know_no_ends(without: Problem):
-    found = jaxba.covariance(with_bars(without), datum="inner")
-    assert found.position_offset.shape == (6, 6)
+def test_inner_constraints_leave_the_scale_to_the_bars():
+    """The reference has the plain rows, and constraints over what they leave free: six directions."""
+    problem = small_block()
+    problem = calibrated(with_scale_bars(problem, [0, 5], [9, 14], [30.0, 25.0], [0.01, 0.02]))
+    found = jaxba.statistics(problem, datum="inner")
+    assert [prior.name for prior in found.problem.priors] == ["intrinsics", "scale_bar"]
+    alone = plain(found.problem, dataclasses.replace(
+        found.problem, priors=found.problem.priors[:1], position_offset=np.zeros((0, 3)),
+        free=dataclasses.replace(found.problem.free, position_offset=np.array(False)),
+    ))  # fmt: skip
+    expected, _ = bordered_inverse(Dense(alone), alone, 6)
+    assert_inner(found.covariance, expected, alone)
+    total = sum(np.nansum(rows.redundancy) for rows in (found.observations, *found.priors))
+    assert total == pytest.approx(found.covariance.redundancy, abs=1e-6)
 
 
 def test_offsets_that_are_held_go_into_the_positions(without: Problem):

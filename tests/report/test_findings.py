@@ -25,6 +25,11 @@ CASES = [
         "Sigmas were not computed.",
     ),
     (
+        Finding.of("sigmas of the shape"),
+        "The block has no place on earth: sigmas of positions and points say how well its shape is known, under inner "
+        "constraints over its points.",
+    ),
+    (
         Finding.of("scale bars without ends", names=["a-b", "c-d"]),
         "Scale bars of which fewer than two adjusted photos show an end: a-b, c-d; mark the ends in more photos.",
     ),

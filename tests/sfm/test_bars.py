@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxba import sfm
 from jaxba.geometry import umeyama
@@ -147,6 +148,16 @@ def test_a_block_without_a_place_takes_the_scale_of_its_bars(survey: Simulated, 
     assert said == ["3 scale bars told the scale of a block that has no place on earth: it is in metres."]
     bare = adjusted_without_a_place(survey, ScaleBars.nothing())
     assert scale_error(survey, bare.block) < -0.9
+    # sigmas are those of the shape, so the truth is brought onto it by place and rotation alone
+    sigmas, none = (sfm.uncertainty(of, survey.reference) for of in (found, bare))
+    assert none.why_not is not None and np.isnan(none.position_std_m).all() and not none.is_of_shape
+    assert sigmas.why_not is None and sigmas.is_of_shape and sigmas.covariance is not None
+    truth, block = survey.survey.truth, found.block
+    true_m, middle = np.asarray(truth.points)[block.track_index], block.points_m.mean(axis=0)
+    turn, _ = Rotation.align_vectors(block.points_m - middle, true_m - true_m.mean(axis=0))
+    off_m = block.centers_m - turn.apply(np.asarray(truth.poses.center) - true_m.mean(axis=0)) - middle
+    squared = np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(sigmas.covariance.centers), off_m) / 3
+    assert 0.2 < squared.mean() < 2 and sigmas.position_std_m.max() < 0.5  # heights go with the focal length
 
 
 def test_two_bars_against_each_other_tell_no_scale_and_three_tell_which_is_wrong(

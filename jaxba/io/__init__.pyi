@@ -10,11 +10,20 @@ from ._colmap import (
     write_colmap_text as write_colmap_text,
 )
 from ._crs import CrsText as CrsText
-from ._csv_bars import BAR_RESULT_COLUMNS as BAR_RESULT_COLUMNS, write_csv_bars as write_csv_bars
-from ._csv_cloud import CLOUD_COLUMNS as CLOUD_COLUMNS, write_csv_cloud as write_csv_cloud
+from ._csv_bars import (
+    BAR_RESULT_COLUMNS as BAR_RESULT_COLUMNS,
+    bars_frame as bars_frame,
+    write_csv_bars as write_csv_bars,
+)
+from ._csv_cloud import (
+    CLOUD_COLUMNS as CLOUD_COLUMNS,
+    cloud_frame as cloud_frame,
+    write_csv_cloud as write_csv_cloud,
+)
 from ._csv_control import (
     CONTROL_COLUMNS as CONTROL_COLUMNS,
     ControlTable as ControlTable,
+    control_frame as control_frame,
     write_csv_control as write_csv_control,
 )
 from ._gcp import (
@@ -40,7 +49,12 @@ from ._problem import problem_of_bytes as problem_of_bytes, read_problem as read
 from ._read import read_bytes as read_bytes, text_of as text_of
 from ._read_colmap import ColmapModel as ColmapModel, read_colmap_text as read_colmap_text
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
-from ._sites import SITE_COLUMNS as SITE_COLUMNS, Sites as Sites, make_sites as make_sites
+from ._sites import (
+    SITE_COLUMNS as SITE_COLUMNS,
+    Sites as Sites,
+    attitude_deg as attitude_deg,
+    make_sites as make_sites,
+)
 from ._tile import Contents as Contents, read_loss as read_loss, read_tile as read_tile, write_tile as write_tile
 from ._tiles import (
     TileFile as TileFile,

@@ -2,9 +2,14 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxba._atomic import write_atomically
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+else:
+    DataFrame = Any
 
 BAR_RESULT_COLUMNS = {
     "first": "name of the point at one end",
@@ -23,14 +28,22 @@ _DECIMALS = {"over_sigma": 1}
 _USUAL = 4
 
 
+def bars_frame(rows: Sequence[Mapping[str, Any]]) -> DataFrame:
+    """Return scale bars as `bars.csv` has them; `rows` as of `write_csv_bars`."""
+    import pandas as pd
+
+    return pd.DataFrame([[row[name] for name in BAR_RESULT_COLUMNS] for row in rows], columns=list(BAR_RESULT_COLUMNS))
+
+
 def write_csv_bars(path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]]) -> None:
     """Write scale bars, whole or not at all.
 
     - `rows`: a mapping a bar, with the names of `BAR_RESULT_COLUMNS`; NaN where a number is not known.
     """
     lines = [",".join(BAR_RESULT_COLUMNS)]
-    for row in rows:
-        lines.append(",".join(_cell(row[name], _DECIMALS.get(name, _USUAL)) for name in BAR_RESULT_COLUMNS))
+    for row in bars_frame(rows).itertuples(index=False):
+        cells = zip(BAR_RESULT_COLUMNS, row, strict=True)
+        lines.append(",".join(_cell(value, _DECIMALS.get(name, _USUAL)) for name, value in cells))
     with write_atomically(path) as file:
         file.write("\n".join([*lines, ""]).encode())
 

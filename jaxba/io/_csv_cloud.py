@@ -8,7 +8,7 @@ holds the CRS (EPSG code and WKT), the units, what heights are above, and the nu
 
 import json
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +16,11 @@ from jaxtyping import Float
 from jaxba._atomic import write_atomically
 from jaxba.io._cloud import Cloud
 from jaxba.io._crs import CrsText
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+else:
+    DataFrame = Any
 
 CLOUD_COLUMNS = {
     "X": "east, in the unit of the CRS",
@@ -33,6 +38,24 @@ CLOUD_COLUMNS = {
     "EPSG": "code of the CRS, with that of its heights after a plus sign; empty where there is none",
 }
 _ROW = "{:.3f},{:.3f},{:.3f},{:.0f},{:.3f},{:.0f}"
+
+
+def cloud_frame(cloud: Cloud, crs: CrsText | None) -> DataFrame:
+    """Return the points of a cloud as `cloud.csv` has them, with all digits; NaN for an empty cell.
+
+    >>> one = np.ones(1, int)
+    >>> cloud = Cloud(xyz=np.array([[1.0, 2, 3]]), rgb=np.zeros((1, 3), np.uint8), point_id=one, track_length=one,
+    ...     error_px=np.array([0.25]), std_m=np.full((1, 3), np.nan))
+    >>> cloud_frame(cloud, None)[["X", "error_px", "R"]].to_numpy().tolist()
+    [[1.0, 0.25, 0.0]]
+    """
+    import pandas as pd
+
+    columns = (
+        *cloud.xyz.T, cloud.point_id, cloud.error_px, cloud.track_length, *cloud.std_m.T, *cloud.rgb.T,
+        np.full(cloud.num_points, "" if crs is None else crs.code, object),
+    )  # fmt: skip
+    return pd.DataFrame(dict(zip(CLOUD_COLUMNS, columns, strict=True)))
 
 
 def write_csv_cloud(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText | None) -> None:
@@ -54,12 +77,12 @@ def write_csv_cloud(path: str | os.PathLike[str], cloud: Cloud, crs: CrsText | N
     """
     label = os.fspath(path)
     cloud.check(label)
-    code = "" if crs is None else crs.code
-    measured = np.column_stack([cloud.xyz, cloud.point_id, cloud.error_px, cloud.track_length]).tolist()
-    sigmas = _sigma_cells(cloud.std_m)
+    frame = cloud_frame(cloud, crs)
+    of_point, of_sigma, of_colour = (frame.iloc[:, part].to_numpy() for part in (slice(6), slice(6, 9), slice(9, 12)))
     lines = [",".join(CLOUD_COLUMNS)]
-    # 100,000 points take 0.46 s; pandas' to_csv takes 0.68 s, and its import 0.3 s
-    for row, std, rgb in zip(measured, sigmas, cloud.rgb.tolist(), strict=True):
+    # 100,000 points take 0.46 s; pandas' to_csv takes 0.68 s
+    cells = of_point.tolist(), _sigma_cells(of_sigma), of_colour.tolist(), frame["EPSG"]
+    for row, std, rgb, code in zip(*cells, strict=True):
         lines.append(f"{_ROW.format(*row)},{std},{rgb[0]},{rgb[1]},{rgb[2]},{code}")
     lines.append("")
     description = (json.dumps(_description(cloud, crs), indent=1) + "\n").encode()

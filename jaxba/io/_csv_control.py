@@ -7,11 +7,17 @@ is not known is empty, with the reason in the last column.
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba._atomic import write_atomically
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+else:
+    DataFrame = Any
 
 CONTROL_COLUMNS = {
     "name": "name of the point in the list",
@@ -46,6 +52,10 @@ CONTROL_COLUMNS = {
     "reason": "why cells of the row are empty",
 }
 _DECIMALS = 4
+_DECIMALS_OF = {
+    **{"mark_rms_px": 2, "over_sigma": 1, "reach_m": 3},
+    **dict.fromkeys(("detectable_east_m", "detectable_north_m", "detectable_up_m"), 3),
+}
 _AXES = ("east", "north", "up")
 
 
@@ -76,6 +86,35 @@ class ControlTable:
     reasons: Sequence[str]
 
 
+def control_frame(table: ControlTable) -> DataFrame:
+    """Return the points of a table as `control.csv` has them; NaN for an empty cell, coordinates as they are written."""
+    import pandas as pd
+
+    # of what is written, so that readers who subtract it find the same
+    surveyed, adjusted = np.round(table.surveyed, _DECIMALS), np.round(table.adjusted, _DECIMALS)
+    reach_m = np.where(np.isfinite(table.reach_m), table.reach_m, -np.inf).max(axis=1, initial=-np.inf)
+    aside = [" ".join(axis for axis, is_so in zip(_AXES, row, strict=True) if is_so) for row in table.is_set_aside]
+    columns = (
+        list(table.names),
+        np.where(table.is_check, "check", "control"),
+        table.num_marks,
+        *surveyed.T,
+        *adjusted.T,
+        *np.round(adjusted - surveyed, _DECIMALS).T,
+        *table.residual_m.T,
+        *table.std_m.T,
+        table.mark_rms_px,
+        table.over_sigma,
+        np.where(table.is_suspect, "yes", "no"),
+        aside,
+        *table.without_m.T,
+        *table.detectable_m.T,
+        np.where(np.isfinite(reach_m), reach_m, np.nan),
+        list(table.reasons),
+    )
+    return pd.DataFrame(dict(zip(CONTROL_COLUMNS, columns, strict=True)))
+
+
 def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None:
     """Write the points of a table, whole or not at all.
 
@@ -89,34 +128,22 @@ def write_csv_control(path: str | os.PathLike[str], table: ControlTable) -> None
     a,control,1,1.0000,2.0000,,1.0000,2.0000,,0.0000,0.0000,,1.0000,2.0000
     """
     lines = [",".join(CONTROL_COLUMNS)]
-    for k, name in enumerate(table.names):
-        # of what is written, so that readers who subtract it find the same
-        surveyed, adjusted = np.round(table.surveyed[k], _DECIMALS), np.round(table.adjusted[k], _DECIMALS)
-        numbers = [
-            *surveyed,
-            *adjusted,
-            *np.round(adjusted - surveyed, _DECIMALS),
-            *table.residual_m[k],
-            *table.std_m[k],
-        ]
-        # csv's writer leaves blanks and semicolons bare, and spreadsheets split at them when they are told to
-        cells = [
-            _quoted(name, ',"; '),
-            "check" if table.is_check[k] else "control",
-            str(table.num_marks[k]),
-            *(_cell(value, _DECIMALS) for value in numbers),
-            _cell(table.mark_rms_px[k], 2),
-            _cell(table.over_sigma[k], 1),
-            "yes" if table.is_suspect[k] else "no",
-            " ".join(axis for axis, aside in zip(_AXES, table.is_set_aside[k], strict=True) if aside),
-            *(_cell(value, _DECIMALS) for value in table.without_m[k]),
-            *("inf" if value == np.inf else _cell(value, 3) for value in table.detectable_m[k]),
-            _cell(np.max(table.reach_m[k], initial=-np.inf, where=np.isfinite(table.reach_m[k])), 3),
-            _quoted(table.reasons[k], ',"'),
-        ]
-        lines.append(",".join(cells))
+    for row in control_frame(table).itertuples(index=False):
+        lines.append(",".join(_text(name, value) for name, value in zip(CONTROL_COLUMNS, row, strict=True)))
     with write_atomically(path) as file:
         file.write("\n".join([*lines, ""]).encode())
+
+
+def _text(name: str, value: Any) -> str:
+    """Return a cell of a column."""
+    if isinstance(value, str):
+        # csv's writer leaves blanks and semicolons bare, and spreadsheets split at them when they are told to
+        return _quoted(value, ',"; ' if name == "name" else ',"')
+    if name == "marks":
+        return str(value)
+    if name.startswith("detectable") and value == np.inf:
+        return "inf"
+    return _cell(value, _DECIMALS_OF.get(name, _DECIMALS))
 
 
 def _cell(value: float, decimals: int) -> str:

@@ -6,12 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from blocks import flown_cloud
 from pyproj import CRS
 
 from jaxba._errors import JaxbaError
-from jaxba.io import CrsText, write_csv_cloud
+from jaxba.io import CLOUD_COLUMNS, CrsText, cloud_frame, write_csv_cloud
 from jaxba.io._read_cloud import read_csv_cloud
 
 UTM = CrsText(
@@ -85,3 +86,11 @@ def test_cloud_without_points_is_refused(tmp_path: Path):
     empty = replace(cloud, **{name: getattr(cloud, name)[:0] for name in vars(cloud)})
     with pytest.raises(JaxbaError, match=r"cloud\.csv: not written, the cloud has no points"):
         write_csv_cloud(tmp_path / "cloud.csv", empty, None)
+
+
+def test_the_table_is_what_is_written(tmp_path: Path):
+    cloud = replace(flown_cloud(), std_m=np.full((flown_cloud().num_points, 3), 0.0123))
+    write_csv_cloud(tmp_path / "cloud.csv", cloud, UTM)
+    written, table = pd.read_csv(tmp_path / "cloud.csv"), cloud_frame(cloud, UTM)
+    assert list(table.columns) == list(written.columns) == list(CLOUD_COLUMNS)
+    np.testing.assert_allclose(written.to_numpy(float), table.to_numpy(float), rtol=0, atol=0.0005 + 1e-9)

@@ -182,6 +182,9 @@ def run(
     require_connected: Annotated[
         bool, Parameter(negative="", show_default=False, help="Stop where the photos fall into several groups.")
     ] = False,
+    report: Annotated[
+        bool, Parameter(negative="", show_default=False, help="Write the project's report at the end, as jaxba report.")
+    ] = False,
     workers: Annotated[WorkerOptions | None, Parameter(name="*")] = None,
     json: Annotated[
         bool, Parameter(negative="", show_default=False, help="Print one JSON object on standard output.")
@@ -214,6 +217,7 @@ def run(
         stage=stage,
         changes=set_,
         require_connected=require_connected,
+        report=report,
         workers=workers or WorkerOptions(),
         as_json=json,
         quiet=quiet,
@@ -269,6 +273,25 @@ def diagnose(
     from jaxba.cli._project import tell_diagnoses
 
     return tell_diagnoses(project, as_json=json)
+
+
+@app.command(
+    help="Write the report of a project: report.html, one page that needs no network; report.json with every number of "
+    "it; and report/ with tables as CSV and figures as PNG. Also of a run that stopped or was killed.\n\n"
+    "Exit codes: 0 written, 2 no project."
+)
+def report(
+    project: _Project,
+    /,
+    *,
+    open_: Annotated[
+        bool, Parameter(name="--open", negative="", show_default=False, help="Show the page in the browser.")
+    ] = False,
+    json: _Json = False,
+) -> int:
+    from jaxba.cli._project import make_report
+
+    return make_report(project, show=open_, as_json=json)
 
 
 @app.command(help="Print a jaxba.toml with every parameter: its default, range and one line of meaning.")

@@ -1,4 +1,4 @@
-"""Commands on a project that is there: `status`, `verify`, `diagnose`; each prints what `jaxba.report` finds.
+"""Commands on a project that is there: `status`, `verify`, `diagnose`, `report`; each tells what `jaxba.report` finds.
 
 All three list the findings of the adjustment, as the run itself does.
 """
@@ -6,6 +6,7 @@ All three list the findings of the adjustment, as the run itself does.
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxba.cli._text import labelled, many, to_json, wrapped
 from jaxba.engine import changed, from_toml
@@ -19,6 +20,31 @@ _STATUS_LABEL = 10
 _CHECK_LABEL = 9
 _DIAGNOSIS_LABEL = 8
 _FINDINGS_LABEL = 10
+_REPORT_LABEL = 8
+
+
+def make_report(project: Path, *, show: bool, as_json: bool) -> int:
+    """Write the report of a project, say what it comes to and where it lies; return 0."""
+    from jaxba.report.document import write_report
+
+    page, facts = write_report(project, PIPELINE)
+    if as_json:
+        print(to_json(facts))
+    else:
+        _print_report(page, facts)
+    if show:
+        import webbrowser
+
+        webbrowser.open(page.absolute().as_uri())
+    return 0
+
+
+def _print_report(page: Path, facts: dict[str, Any]) -> None:
+    rows = [("state", facts["project"]["reason"])] if facts["project"]["reason"] else []
+    rows.append((facts["verdict"]["state"], facts["verdict"]["text"]))
+    rows += [(light["state"], f"{light['name']}: {light['value']}") for light in facts["quality"] if light["value"]]
+    for label, text in (*rows, ("report", str(page))):
+        print(wrapped(label, text, _REPORT_LABEL))
 
 
 def tell_status(project: Path, *, config: Path | None, changes: Sequence[str], as_json: bool) -> int:

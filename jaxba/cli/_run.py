@@ -16,7 +16,7 @@ from jaxba.cli._settings import configured
 from jaxba.cli._text import first_of, labelled, many, to_json, wrapped
 from jaxba.engine import changed
 from jaxba.engine._compile_cache import use_compilation_cache
-from jaxba.pipeline import Event, Run, run_pipeline
+from jaxba.pipeline import PIPELINE, Event, Run, run_pipeline
 from jaxba.report import accuracy_row, bar_rows, control_rows, flight_lines, statistics_rows
 
 _SUMMARY_LABEL = 12
@@ -36,6 +36,7 @@ def run(
     stage: str | None,
     changes: Sequence[str],
     require_connected: bool,
+    report: bool,
     workers: WorkerOptions,
     as_json: bool,
     quiet: bool,
@@ -93,10 +94,15 @@ def run(
         return BAD_INPUT
     if json_lines is not None:
         json_lines.say("run_end", seconds=round(time.monotonic() - begun, 3), stages_run=list(result.stages_run))
+    page = None
+    if report:
+        from jaxba.report.document import write_report
+
+        page = write_report(out, PIPELINE)[0]
     if as_json:
         print(to_json(result.facts))
     elif not quiet:
-        _print_summary(result, out)
+        _print_summary(result, out, page)
     return 0 if result.facts.get("adjust", {}).get("usable", True) else UNUSABLE
 
 
@@ -105,7 +111,7 @@ def _clear(show: Progress | None) -> None:
         show.clear()
 
 
-def _print_summary(result: Run, out: Path) -> None:
+def _print_summary(result: Run, out: Path, page: Path | None) -> None:
     facts = result.facts
     rows: list[tuple[str, str]] = []
     if "adjust" in facts:
@@ -123,6 +129,8 @@ def _print_summary(result: Run, out: Path) -> None:
         rows.append(
             ("files", f"{many(len(facts['export']['files']), 'file')} in {out / 'export'}, see README.txt there")
         )
+    if page is not None:
+        rows.append(("report", str(page)))
     if not result.stages_run:
         print("nothing to do: the photos and settings are those of the last run")
     print()

@@ -8,6 +8,7 @@ project/
   unfinished/<stage>/  what a stage that does all photos at once has done so far, where it was stopped
   export/              the results
   summary.json         what became of each stage and each photo
+  times.json           seconds that each stage took when it last had anything to do
   .lock, .lock.holder  held by the run that works here; who that is
 """
 
@@ -27,7 +28,7 @@ from jaxba.engine._store import sha256
 from jaxba.io import text_of
 from jaxba.scene import PhotoFile
 
-SETTINGS, SUMMARY, EXPORT = "jaxba.toml", "summary.json", "export"
+SETTINGS, SUMMARY, EXPORT, TIMES = "jaxba.toml", "summary.json", "export", "times.json"
 _RUN, _PHOTOS = "run.json", "photos.json"
 FOUND_LISTS = {"geotags": "geo.txt", "gcp": "gcp_list.txt"}
 """Names, in any case, of the lists that are used where they lie among the photos and no other is given."""

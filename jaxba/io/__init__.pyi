@@ -52,8 +52,8 @@ from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
 from ._sites import (
     SITE_COLUMNS as SITE_COLUMNS,
     Sites as Sites,
-    attitude_deg as attitude_deg,
     make_sites as make_sites,
+    omega_phi_kappa_deg as omega_phi_kappa_deg,
 )
 from ._tile import Contents as Contents, read_loss as read_loss, read_tile as read_tile, write_tile as write_tile
 from ._tiles import (

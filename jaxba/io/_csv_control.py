@@ -87,7 +87,7 @@ class ControlTable:
 
 
 def control_frame(table: ControlTable) -> DataFrame:
-    """Return the points of a table as `control.csv` has them; NaN for an empty cell, coordinates as they are written."""
+    """Return the points of a table as `control.csv` has them; NaN for an empty cell, coordinates as written."""
     import pandas as pd
 
     # of what is written, so that readers who subtract it find the same

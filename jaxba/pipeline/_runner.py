@@ -23,7 +23,7 @@ from jaxba.engine._items import Item
 from jaxba.engine._limits import check_failures
 from jaxba.engine._lock import holder_file, locked
 from jaxba.engine._parameters import Parameters
-from jaxba.engine._project import SETTINGS, SUMMARY, Given, Project, read_lists, refuse_photo_folder
+from jaxba.engine._project import SETTINGS, SUMMARY, TIMES, Given, Project, read_lists, refuse_photo_folder
 from jaxba.engine._room import Room
 from jaxba.engine._settings import Settings, to_toml
 from jaxba.engine._stage import Stage, left_out
@@ -110,6 +110,8 @@ def _run_stages(project: Project, given: Given, done: Done, until: str | None, t
         if total:
             stages_run.append(stage.name)
         seconds = time.perf_counter() - begun
+        if total:
+            project.write_json(TIMES, {**_times(project), stage.name: round(seconds, 3)})
         left_here = left_out(STAGES, done)[stage.name]
         say = functools.partial(stage.module.lines, outputs, told_of(done, left_here))
         said, odd = described("the sentences on this stage", say, ["done"])
@@ -118,6 +120,11 @@ def _run_stages(project: Project, given: Given, done: Done, until: str | None, t
         if stage.name == until:
             break
     return end()
+
+
+def _times(project: Project) -> dict[str, float]:
+    found = project.read_json(TIMES)
+    return found if isinstance(found, dict) else {}
 
 
 def _run_stage(

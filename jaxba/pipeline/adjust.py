@@ -92,11 +92,13 @@ class Outputs:
     - `block`: what was adjusted; its observations are those used.
     - `error_px`: reprojection error of each observation. `point_error_px`: mean over each point's observations.
     - `position_std_m`: sigma of each registered image's position, east, north, up; NaN where it was not computed.
+    - `position_covariance_m2`: of the same; NaN in the rows and columns of axes without a sigma.
     - `point_std_m`: sigma of each point; NaN likewise.
     - `intrinsics_std`: sigma of each intrinsic.
     - `gnss_residual_m`: adjusted minus measured position, less what its flight is off; NaN where none was used.
     - `median_px`, `inlier_rate`, `variance_factor`, `num_rejected`, `rounds`: figures of the adjustment.
     - `gnss_rms_m`: RMS of adjusted minus measured position an axis over the `num_gnss` positions that are no outliers.
+    - `limit_px`: error over which an observation was rejected, if its track is long; shorter ones fit better by chance.
     - `std_px`: sigma of an observation's coordinates. `spread`: times it that errors really bear on the result, which
       the sigmas of the results allow for. `loss`, `loss_f_scale`: of the observations, its scale in those sigmas.
     - `position_scale`: factor on the sigmas of positions, an axis.
@@ -140,6 +142,8 @@ class Outputs:
     loss_f_scale: float = 1.0
     statistics: SurveyStatistics | None = None
     affine: Float[np.ndarray, "3 4"] = field(default_factory=lambda: np.eye(3, 4))
+    position_covariance_m2: Float[np.ndarray, "images 3 3"] | None = None
+    limit_px: float = np.nan
 
     @property
     def gnss_minus_control_m(self) -> Float[np.ndarray, "3"]:
@@ -243,7 +247,16 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         if judged is None
         else sfm.survey_statistics(adjusted, judged, inputs.reference, inputs.control),
         affine=controlled.affine,
+        position_covariance_m2=_position_covariance(sigmas),
+        limit_px=adjusted.limit_px,
     )
+
+
+def _position_covariance(sigmas: Any) -> Float[np.ndarray, "images 3 3"]:
+    """Return the covariances of the cameras' places, NaN along axes that have no sigma."""
+    known = np.isfinite(sigmas.position_std_m)
+    blocks = np.zeros((*known.shape, 3)) if sigmas.covariance is None else sigmas.covariance.centers
+    return np.where(known[:, :, None] & known[:, None, :], blocks, np.nan)
 
 
 def lines(outputs: Outputs, told: Told) -> list[str]:

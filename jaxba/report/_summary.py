@@ -50,7 +50,7 @@ def summary(
         for stage, entries in left_out(stages, done).items()
         for entry in entries
     ]
-    return _finite(facts)
+    return finite(facts)
 
 
 def left_out_by_last_run(facts: object, stage: str) -> tuple[LeftOut, ...]:
@@ -62,10 +62,10 @@ def left_out_by_last_run(facts: object, stage: str) -> tuple[LeftOut, ...]:
     return tuple(LeftOut(name=entry["name"], reason=entry["reason"]) for entry in entries if entry["stage"] == stage)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """Return plain values in which None stands for numbers that are not finite, which JSON lacks."""
     if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
+        return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

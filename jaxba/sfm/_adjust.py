@@ -66,6 +66,7 @@ class Adjusted:
     - `problem`, `loss`: of the last solve, at its solution. `solution`: of the last solve.
     - `std_px`: sigma of an observation's coordinates. `position_scale`: factor on the sigmas of positions.
     - `num_judged`: observations that were judged by their error; those not in the block were rejected.
+    - `limit_px`: error over which they were, of an observation in a long track (`_judge.py`); NaN without a round.
     - `medians_px`: of each round's observations after its solve. `converged`: the median no longer changed.
     - `control`: the control points of the last solve, their start values at its solution; `on_control`: what their
       tests said. `mark_used`: of all marks, those that agree with the others of their point.
@@ -84,6 +85,7 @@ class Adjusted:
     std_px: float
     position_scale: Float[np.ndarray, "3"]
     num_judged: int
+    limit_px: float
     medians_px: tuple[float, ...]
     converged: bool
     pruned: tuple[PrunedEdge, ...]
@@ -244,6 +246,7 @@ def adjust(
         std_px=std_px,
         position_scale=solved.position_scale,
         num_judged=max(num_judged, block.num_observations),
+        limit_px=np.nan if limit_px is None else limit_px,
         medians_px=tuple(medians),
         converged=converged and solved.solution.converged,
         pruned=tuple(pruned),

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from jaxba.report import statistics_facts, statistics_rows
-from jaxba.report._summary import _finite
+from jaxba.report._summary import finite
 from jaxba.scene import MeasuredKind, SurveyStatistics
 
 
@@ -40,7 +40,7 @@ FOUND = SurveyStatistics(
 
 
 def test_each_kind_is_told_beside_what_it_was_taken_for() -> None:
-    facts = json.loads(json.dumps(_finite(statistics_facts(FOUND))))  # as summary.json has them
+    facts = json.loads(json.dumps(finite(statistics_facts(FOUND))))  # as summary.json has them
     assert statistics_rows(facts) == [
         (
             "scatter",

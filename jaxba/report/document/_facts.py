@@ -1,0 +1,189 @@
+"""Everything that a report says, as plain values: `report.json`, made of the records that the stages left.
+
+The form is told in `_schema.py`. Numbers that are not known are None; a section that has no data says why in `none`.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxba
+from jaxba.engine._project import SETTINGS, SUMMARY, TIMES, Project
+from jaxba.engine._settings import from_toml
+from jaxba.engine._stage import Pipeline, left_out
+from jaxba.engine._versions import installed
+from jaxba.report._findings import sentences
+from jaxba.report._recorded import Recorded, recorded
+from jaxba.report._summary import finite
+from jaxba.report.document._glossary import GLOSSARY
+from jaxba.report.document._lights import gsd_m, lights, verdict
+from jaxba.report.document._material import Material
+from jaxba.report.document._photos import cloud, overlap, pair_rows, photo_rows
+from jaxba.report.document._residuals import residuals
+from jaxba.report.document._survey import (
+    accuracy_section,
+    attitudes,
+    bars,
+    cameras,
+    control,
+    correlation,
+    place,
+    positions,
+    statistics,
+)
+
+SCHEMA = 1
+
+
+def report_facts(folder: Path, pipeline: Pipeline) -> dict[str, Any]:
+    """Return what there is to report of a project, also of one whose run has not ended.
+
+    Raises `JaxbaError` where the folder is no project, or a list that the run was given cannot be read any more.
+    """
+    project = Project(folder, make=False)
+    found = recorded(folder, pipeline)
+    summary, seconds = project.read_json(SUMMARY), project.read_json(TIMES)
+    material = Material(
+        folder=project.folder,
+        found=found,
+        summary=summary if isinstance(summary, dict) else {},
+        settings=from_toml(project.folder / SETTINGS, pipeline.settings),
+        defaults=pipeline.settings,
+        seconds=seconds if isinstance(seconds, dict) else {},
+    )
+    rows = lights(material)
+    facts = {
+        "schema": SCHEMA,
+        "project": _project(material, project),
+        "verdict": verdict(material, rows),
+        "quality": rows,
+        "findings": sentences(found.findings),
+        "summary": _summary(material),
+        "cloud": cloud(material),
+        "photos": photo_rows(material),
+        "pairs": pair_rows(material),
+        "overlap": overlap(material),
+        "residuals": residuals(material),
+        "cameras": cameras(material),
+        "correlation": correlation(material),
+        "positions": positions(material),
+        "attitudes": attitudes(material),
+        "control": control(material),
+        "bars": bars(material),
+        "statistics": statistics(material),
+        "accuracy": accuracy_section(material),
+        "left_out": _left_out(material, pipeline),
+        "processing": _processing(material, pipeline),
+        "glossary": [{"term": term, "text": text} for term, text in GLOSSARY.items()],
+    }
+    plain: dict[str, Any] = finite(facts)
+    return plain
+
+
+def _project(material: Material, project: Project) -> dict[str, Any]:
+    times = sorted(photo.time for photo in material.photos if photo.time)
+    state, reason = _state(material.found)
+    given, _ = project.read_given()
+    return {
+        "name": material.folder.absolute().name,
+        "photos": str(given.photos),
+        "jaxba": jaxba.__version__,
+        "state": state,
+        "reason": reason,
+        **place(material.frame),
+        "first_photo": times[0] if times else None,
+        "last_photo": times[-1] if times else None,
+        "outputs": project.export.name,
+    }
+
+
+def _state(found: Recorded) -> tuple[str, str | None]:
+    """Return how the last run ended, and why where it did not."""
+    if found.running is not None:
+        return "running", f"A run works on it: {found.running}."
+    if found.killed is not None:
+        return "killed", f"The last run was killed in the stage {found.killed}; run the same command again to go on."
+    if found.stopped is not None:
+        return "stopped", f"The last run stopped in the stage {found.stopped.name}: {found.stopped.reason}"
+    if found.stale is not None:
+        return "unfinished", f"The stage {found.stale} is out of date, so that it and what follows are left out here."
+    if found.done.export is None:
+        return "unfinished", "The run did not go on to the export."
+    return "complete", None
+
+
+def _summary(material: Material) -> list[dict[str, str]]:
+    adjusted = material.adjusted
+    rows = [("Photos", f"{len(material.photos):,}")]
+    if adjusted is None:
+        return [{"name": name, "value": value} for name, value in rows]
+    block = adjusted.block
+    views = np.bincount(block.observation_point, minlength=block.num_points)
+    gsd = gsd_m(material)
+    rows = [
+        ("Photos adjusted", f"{block.num_images:,} of {len(material.photos):,}"),
+        ("Cameras", f"{len(block.camera_names)}"),
+        ("Points", f"{block.num_points:,}"),
+        ("Points in three photos or more", f"{int((views > 2).sum()):,}"),
+        ("Image points", f"{block.num_observations:,}"),
+        ("Image points rejected", f"{adjusted.num_rejected:,}"),
+        ("Median reprojection error", f"{adjusted.median_px:.2f} px"),
+        ("Sigma of an image coordinate", f"{adjusted.std_px * adjusted.spread:.2f} px"),
+        ("Rounds of adjustment", f"{adjusted.rounds}"),
+    ]
+    if np.isfinite(gsd):
+        rows.append(("Ground sample distance", f"{100 * gsd:.2f} cm/px"))
+    known = np.isfinite(adjusted.position_std_m).all(axis=1)
+    if known.any():
+        median = ", ".join(f"{value:.3f}" for value in np.median(adjusted.position_std_m[known], axis=0))
+        rows.append(("Sigma of a camera, median", f"{median} m east, north, up"))
+    known = np.isfinite(adjusted.point_std_m).all(axis=1)
+    if known.any():
+        median = ", ".join(f"{value:.3f}" for value in np.median(adjusted.point_std_m[known], axis=0))
+        rows.append(("Sigma of a point, median", f"{median} m east, north, up"))
+    return [{"name": name, "value": value} for name, value in rows]
+
+
+def _left_out(material: Material, pipeline: Pipeline) -> list[dict[str, str]]:
+    return [
+        {"stage": stage, "name": entry.name, "reason": entry.reason}
+        for stage, entries in left_out(pipeline.stages, material.done).items()
+        for entry in entries
+    ]
+
+
+def _processing(material: Material, pipeline: Pipeline) -> dict[str, Any]:
+    """Return parameters, stages with their times, versions, and hashes of what came in and went out."""
+    done = material.done
+    parameters = []
+    for section, params in material.settings.items():
+        for name, value in vars(params).items():
+            default = getattr(material.defaults[section], name)
+            parameters.append(
+                {
+                    "section": section,
+                    "name": name,
+                    "value": _text(value),
+                    "default": _text(default),
+                    "changed": value != default,
+                }
+            )
+    said = material.summary.get("stages", {})
+    exported = done.export
+    return {
+        "parameters": parameters,
+        "stages": [
+            {"name": name, "seconds": material.seconds.get(name), "lines": list(said.get(name, ()))}
+            for name in pipeline.names
+        ],
+        "versions": [{"name": name, "version": version} for name, version in sorted(installed().items())],
+        "inputs": [{"name": photo.name, "sha256": photo.sha256} for photo in material.photos],
+        "outputs": []
+        if exported is None
+        else [{"name": n, "sha256": h} for n, h in zip(exported.files, exported.sha256, strict=True)],
+    }
+
+
+def _text(value: Any) -> str:
+    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,0 +1,36 @@
+"""Write a report beside the project: the page, its numbers, tables as CSV and figures as PNG.
+
+project/
+  report.html       the page: one file, which needs no network
+  report.json       every number of it
+  report/           its tables as CSV and its figures as PNG
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from jaxba._atomic import write_atomically, write_folder_atomically
+from jaxba.engine._stage import Pipeline
+from jaxba.report.document._csv_tables import tables
+from jaxba.report.document._facts import report_facts
+from jaxba.report.document._pngs import pngs
+from jaxba.report.page import page
+
+REPORT = "report"
+
+
+def write_report(folder: Path, pipeline: Pipeline) -> tuple[Path, dict[str, Any]]:
+    """Write the report of a project, also of one whose run has not ended; return the page's path and the facts.
+
+    Raises `JaxbaError` where the folder is no project, or a file cannot be written.
+    """
+    facts = report_facts(folder, pipeline)
+    with write_folder_atomically(folder / REPORT) as partial:
+        for name, content in (*tables(facts).items(), *pngs(facts).items()):
+            (partial / name).write_bytes(content)
+    html = folder / f"{REPORT}.html"
+    for path, text in ((folder / f"{REPORT}.json", json.dumps(facts, indent=1) + "\n"), (html, page(facts))):
+        with write_atomically(path) as file:
+            file.write(text.encode())
+    return html, facts

@@ -15,6 +15,7 @@ from jaxba.io import read_loss, read_tile
 from jaxba.pipeline import PIPELINE
 from jaxba.pipeline._events import Run
 from jaxba.report import control_rows
+from jaxba.report.document import report_facts
 from jaxba.report.verification import Params, verify
 
 
@@ -115,6 +116,29 @@ def test_verification_passes_with_control_in_the_adjustment_and_fitted_afterward
     assert failed(fitted) == []
 
 
+def test_the_report_tells_of_control_what_the_files_and_the_summary_do(run: Run, survey: Survey) -> None:
+    facts = report_facts(survey.project, PIPELINE)
+    found = facts["control"]
+    rows, points = rows_of(survey), {point["name"]: point for point in run.facts["control"]["points"]}
+    assert (found["num_control"], found["num_check"], len(rows)) == (5, 5, 10)
+    for row, point in zip(rows, found["points"], strict=True):
+        assert point["name"] == row["name"] and point["role"] == row["role"]
+        assert [point["adjusted"][k] for k in range(3)] == pytest.approx(
+            [float(row[f"adjusted_{a}"]) for a in "xyz"], abs=1e-4
+        )
+        assert point["residual_m"] == pytest.approx(points[row["name"]]["residual_m"])
+        assert point["survey_std_m"] == [0.02, 0.02, 0.03]
+    of_checks = np.array([point["residual_m"] for point in found["points"] if point["role"] == "check"])
+    np.testing.assert_allclose(found["check_rms_m"], np.sqrt(np.mean(of_checks**2, axis=0)), rtol=1e-9)
+    up = next(row for row in facts["accuracy"]["rows"] if row["name"] == "up")
+    assert up["product_m"] == pytest.approx(np.hypot(found["check_rms_m"][2], 0.03)) and up["num"] == 5
+    lights = {light["name"]: light for light in facts["quality"]}
+    assert lights["Control points"]["state"] == lights["Check points"]["state"] == "good"
+    variance = np.array([np.add(np.square(p["std_m"]), np.square(p["survey_std_m"])) for p in found["points"]])[5:]
+    assert lights["Check points"]["value"] == f"{np.sqrt(np.mean(of_checks**2 / variance)):.2f} sigma"
+    assert facts["positions"]["common_m"] == run.facts["control"]["gnss_minus_control_m"]
+
+
 def test_a_list_that_is_not_there_is_named(survey: Survey, tmp_path: Path) -> None:
     with pytest.raises(JaxbaError, match=r"none.txt: there is no such file; give a gcp_list.txt or CSV"):
         survey.run(gcp=tmp_path / "none.txt", until="control")
@@ -146,4 +170,5 @@ def test_scale_bars_take_part_and_reach_the_summary_and_the_files(survey: Survey
     assert problem.num_bar_ends == 2 and problem.num_points == run.done.adjust.block.num_points + 2
     again = own.run(gcp=tmp_path / "marks.txt", bars=tmp_path / "bars.csv")
     assert again.stages_run == ()
+    assert report_facts(own.project, PIPELINE)["bars"]["bars"] == run.facts["bars"]
     assert [check.text for check in verify(own.project, PIPELINE, Params()) if check.state != "ok"] == []

@@ -1,9 +1,11 @@
 """The facts of a report: each is what the stages recorded and the exports hold, and every field is documented."""
 
 import csv
+import dataclasses
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -17,13 +19,15 @@ from small_survey import FAST, NUM_PHOTOS, Survey
 from jaxba import JaxbaError
 from jaxba.io._read_cloud import read_csv_cloud
 from jaxba.pipeline import PIPELINE
-from jaxba.report import recorded
+from jaxba.report import Recorded, recorded
 from jaxba.report.document import FIELDS, paths_of, report_facts, schema_markdown
 from jaxba.report.document._csv_tables import tables
 from jaxba.report.document._enlarged import enlarged
-from jaxba.report.document._lights import _high, _low
+from jaxba.report.document._lights import _control, _high, _low
+from jaxba.report.document._material import Material
 from jaxba.report.document._pngs import pngs
 from jaxba.report.document._schema import SECTIONS_WITHOUT_DATA
+from jaxba.scene import Control, ControlFit
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +179,27 @@ def test_a_run_that_ended_early_is_reported_as_far_as_it_came(
 )
 def test_a_figure_is_judged_by_its_limits(value: float, low: str, high: str) -> None:
     assert _low(value, (1.5, 3.0)) == low and _high(value, (3.0, 2.0)) == high
+
+
+@pytest.mark.parametrize(("aside", "state"), [(0, "good"), (1, "fair"), (2, "poor"), (4, "poor")])
+def test_control_that_is_mostly_set_aside_is_no_good_control(adjusted: Any, aside: int, state: str) -> None:
+    # breaks where the few points that are left, which agree with each other, are taken for the survey
+    fit = dataclasses.replace(
+        ControlFit.nothing(4),
+        control_rms_m=np.full(3, 0.01),
+        is_set_aside=np.repeat(np.arange(4)[:, None] < aside, 3, axis=1),
+    )
+    control = dataclasses.replace(
+        Control.nothing(),
+        names=tuple("abcd"),
+        xyz_m=np.zeros((4, 3)),
+        std_m=np.ones((4, 3)),
+        is_check=np.zeros(4, bool),
+    )
+    done = SimpleNamespace(adjust=dataclasses.replace(adjusted, control=fit), control=SimpleNamespace(control=control))
+    found = Recorded(done=done, stopped=None, killed=None, running=None, stale=None, failed={})
+    light = _control(Material(Path(), found, {}, {}, {}, {}))
+    assert light["state"] == state and (f"contradicting all else: {aside}." in light["text"]) == bool(aside)
 
 
 def test_the_schema_is_in_the_readme() -> None:

@@ -199,10 +199,9 @@ def _control(material: Material) -> dict[str, Any]:
     text = f"The largest RMS of an axis is {rms.max():.3f} m, {times:.2f} pixels on the ground."
     state = _low(times, _CONTROL)
     if aside:
-        text, state = (
-            f"{text} Points set aside for contradicting all else: {aside}.",
-            "fair" if state == "good" else state,
-        )
+        text = f"{text} Points set aside for contradicting all else: {aside}."
+        most = 2 * aside >= int((~given.is_check).sum())  # the RMS of the few that agree with each other says little
+        state = "poor" if most else "fair" if state == "good" else state
     return _row(name, f"{rms.max():.3f} m", state, text, limits)
 
 

@@ -22,7 +22,6 @@ from jaxba.pipeline import PIPELINE
 from jaxba.report import Recorded, recorded
 from jaxba.report.document import FIELDS, paths_of, report_facts, schema_markdown
 from jaxba.report.document._csv_tables import tables
-from jaxba.report.document._enlarged import enlarged
 from jaxba.report.document._lights import _control, _high, _low
 from jaxba.report.document._material import Material
 from jaxba.report.document._pngs import pngs
@@ -205,8 +204,3 @@ def test_control_that_is_mostly_set_aside_is_no_good_control(adjusted: Any, asid
 def test_the_schema_is_in_the_readme() -> None:
     readme = (Path(__file__).parents[2] / "jaxba" / "report" / "README.md").read_text(encoding="utf-8")
     assert schema_markdown() in readme, "paste the output of jaxba.report.document.schema_markdown() into it"
-
-
-def test_small_things_are_enlarged_by_round_factors() -> None:
-    assert enlarged([], 10.0) == enlarged([0.0], 10.0) == 1.0
-    assert enlarged([0.013], 100.0) == 200.0 and enlarged([1e-4, 2e-4, np.nan], 50.0) == 10_000.0

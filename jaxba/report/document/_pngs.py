@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxba.report._canvas import INK, PALE, axes_at, drawn, fitting, titles
-from jaxba.report.document._enlarged import enlarged
+from jaxba.report.page._drawing import magnification
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 Facts = Mapping[str, Any]
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
+_SHOWN = 0.05  # of a drawing's extent, that what is enlarged may take up
 _MAP_PX = 1250.0, 715.0
 _STATES = {"good": (_BLUE, 0.5), "weak": ("#e69f00", 0.5), "pruned": (_ORANGE, 1.2)}
 
@@ -71,7 +72,7 @@ def _map(figure: "Figure", facts: Facts) -> None:
     photos = facts["photos"]
     sizes = [photo["ellipse_m"][0] for photo in photos if photo["ellipse_m"]]
     extent = float(np.nanmax(np.ptp(places[np.isfinite(places).all(axis=1)], axis=0)))
-    times = enlarged(sizes, extent)
+    times = magnification(np.array(sizes), _SHOWN * extent)
     for photo, place in zip(photos, places, strict=True):
         if photo["ellipse_m"]:
             a, b, azimuth = photo["ellipse_m"]
@@ -146,7 +147,7 @@ def _sensor(figure: "Figure", sensor: Mapping[str, Any]) -> None:
     box = np.array([[0.0, 0.0], [width, height]])
     axes = axes_at(figure, (90, 80, *fitting(box, 860.0, 720.0)))
     known = np.isfinite(dx) & np.isfinite(dy)
-    times = enlarged(np.hypot(dx[known], dy[known]).tolist(), float(width))
+    times = magnification(np.hypot(dx[known], dy[known]), _SHOWN * width)
     axes.quiver(
         x[known], y[known], times * dx[known], times * dy[known], angles="xy", scale_units="xy", scale=1.0, color=_BLUE,
         width=0.002,

@@ -2,25 +2,19 @@
 
 from jaxba.ba._check_gradients import GradientCheck, GradientRow, check_gradients
 from jaxba.ba._compiler import fast_jit
-from jaxba.ba._covariance import Covariance, covariance
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
 from jaxba.ba._projection import project_in_cameras
-from jaxba.ba._propagate import Propagated, propagate
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
 from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
-from jaxba.ba._reliability import NONCENTRALITY, RowStatistics
-from jaxba.ba._reweight import Reweighted, solve_and_reweight
 from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._scale_bars import with_scale_bars
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solve import solve
 from jaxba.ba._solvers import SchurDogleg, SchurLevenbergMarquardt, residuals
-from jaxba.ba._statistics import Statistics, prior_statistics, statistics
 from jaxba.ba._tune import Tuned, tune
 from jaxba.ba._unknowns import Step, Unknowns
-from jaxba.ba._variance_components import VarianceComponent
 from jaxba.ba.checks import Dropped, Prepared, free_gauge, prepare
 from jaxba.ba.groups import (
     PRIORS,
@@ -37,6 +31,12 @@ from jaxba.ba.tiles._batch import solve_batch
 from jaxba.ba.tiles._merge import Merged, MergedTile, merge_tiles
 from jaxba.ba.tiles._partition import BlockTile, Partition, partition
 from jaxba.ba.tiles._solve_tiled import solve_tiled
+from jaxba.ba.uncertainty._covariance import Covariance, covariance
+from jaxba.ba.uncertainty._propagate import Propagated, propagate
+from jaxba.ba.uncertainty._reliability import NONCENTRALITY, RowStatistics
+from jaxba.ba.uncertainty._reweight import Reweighted, solve_and_reweight
+from jaxba.ba.uncertainty._statistics import Statistics, prior_statistics, statistics
+from jaxba.ba.uncertainty._variance_components import VarianceComponent
 
 __all__ = [
     "NONCENTRALITY",

@@ -30,9 +30,9 @@ from jaxba.ba.groups import ControlPointPrior
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from jaxba.ba._covariance import Covariance
-    from jaxba.ba._reliability import RowStatistics
-    from jaxba.ba._variance_components import VarianceComponent
+    from jaxba.ba.uncertainty._covariance import Covariance
+    from jaxba.ba.uncertainty._reliability import RowStatistics
+    from jaxba.ba.uncertainty._variance_components import VarianceComponent
 else:
     DataFrame = Any
 

@@ -39,16 +39,16 @@ from jaxba.scene import (
     ViewGraph,
 )
 from jaxba.sfm._complete import complete_tracks
-from jaxba.sfm._control import ControlPart, Standing, agreeing_marks, mark_std
-from jaxba.sfm._control_start import transformed
 from jaxba.sfm._edges import edge_medians_px, edges_to_prune, match_rows, without_edges
 from jaxba.sfm._intrinsics import free_parameters
 from jaxba.sfm._judge import estimate_std, judge, used_in_track
-from jaxba.sfm._onto_bars import onto_bars, scaling
-from jaxba.sfm._onto_control import OnControl, onto_control
 from jaxba.sfm._points import apply_points, triangulate_tracks
 from jaxba.sfm._rounds import Rounds, Settings, Solved, Tiling, without_images
 from jaxba.sfm._spread import spread
+from jaxba.sfm.control._control import ControlPart, Standing, agreeing_marks, mark_std
+from jaxba.sfm.control._onto_bars import onto_bars, scaling
+from jaxba.sfm.control._onto_control import OnControl, onto_control
+from jaxba.sfm.control._start import transformed
 
 _log = logging.getLogger(__name__)
 

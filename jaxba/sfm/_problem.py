@@ -16,7 +16,7 @@ through a tight prior, not as fixed ones: so all rounds of an adjustment have on
 **A block without a place on earth** is held by weak priors on all positions at its start values: the seven directions
 that photos cannot fix stay where they were, and nothing else is bent (sigma a tenth of the block's extent).
 
-**Control points** stand behind the block's own points and observations (see `_control.py`).
+**Control points** stand behind the block's own points and observations (see `control/_control.py`).
 """
 
 import dataclasses
@@ -41,9 +41,9 @@ from jaxba.ba import (
 )
 from jaxba.geometry import CAMERAS, Cauchy, GemanMcClure, Linear, Pose
 from jaxba.scene import Block, CommonOffset, Photo, Reference
-from jaxba.sfm._control import CONTROL_LOSS, ControlPart
 from jaxba.sfm._intrinsics import NaturalIntrinsics, natural_intrinsics
 from jaxba.sfm._measured import LEAST_POSITIONS, flights_of, used_positions
+from jaxba.sfm.control._control import CONTROL_LOSS, ControlPart
 
 POSITION_LOSS = GemanMcClure(4.0)
 _ASPECT_STD = 5e-4

@@ -21,11 +21,11 @@ from jaxtyping import Bool, Float
 from jaxba.ba import HistoryStep, PlanShape, Problem, Solution, make_plan, reprojection_errors, solve, solve_tiled
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
 from jaxba.scene import Block, Control, Photo, Reference, ScaleBars, Tracks
-from jaxba.sfm._bar_ends import add_bars
-from jaxba.sfm._control import ControlPart, Standing, before_control, control_part
 from jaxba.sfm._measured import position_scale
 from jaxba.sfm._points import track_rows
 from jaxba.sfm._problem import to_problem, with_solution
+from jaxba.sfm.control._bar_ends import add_bars
+from jaxba.sfm.control._control import ControlPart, Standing, before_control, control_part
 
 _log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from dense_reference import Dense, loss_derivatives
 from test_covariance import CASES
 
 from jaxba.ba import Problem, RowStatistics, Statistics, Step, prior_statistics, statistics
-from jaxba.ba._reliability import NONCENTRALITY, POWER, SIGNIFICANCE
+from jaxba.ba.uncertainty._reliability import NONCENTRALITY, POWER, SIGNIFICANCE
 from jaxba.geometry import Linear
 
 _SOLVED = 24  # rows of a group that are left out of the dense equations, which are solved anew

@@ -15,7 +15,6 @@ from jaxba.sfm import (
     Adjusted,
     Settings,
     Uncertainty,
-    _onto_control,
     adjust,
     apply_control,
     control_findings,
@@ -25,11 +24,12 @@ from jaxba.sfm import (
     uncertainty as uncertainty_of,
     with_points,
 )
-from jaxba.sfm._control import agreeing_marks, control_part, intersect, mark_std
-from jaxba.sfm._control_explained import Explained, explain
-from jaxba.sfm._control_fit import Controlled, apply_affine, fit_affine
-from jaxba.sfm._control_start import transformed
-from jaxba.sfm._misclosure import Misclosure
+from jaxba.sfm.control import _onto_control
+from jaxba.sfm.control._control import agreeing_marks, control_part, intersect, mark_std
+from jaxba.sfm.control._explained import Explained, explain
+from jaxba.sfm.control._fit import Controlled, apply_affine, fit_affine
+from jaxba.sfm.control._misclosure import Misclosure
+from jaxba.sfm.control._start import transformed
 from jaxba.simulation.staged import Simulated, simulate, true_block
 
 OFFSET_M = np.array([12.0, -7.0, 31.0])

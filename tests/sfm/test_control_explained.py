@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxba.sfm._control_explained import Explained, explain
-from jaxba.sfm._control_statistics import control_statistics
-from jaxba.sfm._misclosure import Misclosure
+from jaxba.sfm.control._explained import Explained, explain
+from jaxba.sfm.control._misclosure import Misclosure
+from jaxba.sfm.control._statistics import control_statistics
 
 STD_M = np.array([0.02, 0.02, 0.03])
 RTK, PLAIN = "RTK", "plain"

@@ -2,8 +2,8 @@
 
 Up, everything but the border is eliminated as for a step (`_engine.py`), undamped. Down, each node gets the inverse
 over its own images, its boundary and the border from that of its parent (`_fronts.py`), and each tile the covariances
-of its points from the blocks of the inverse that its own images have in common (`_point_marginals.py`). The inverse of
-the whole is nowhere: of a node's part its children's parts are taken, and it goes.
+of its points from the blocks of the inverse that its own images have in common (`_point_marginals.py`). The inverse
+of the whole is nowhere: of a node's part its children's parts are taken, and it goes.
 """
 
 from collections.abc import Iterator
@@ -14,16 +14,23 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.ba._compiler import call_compiled
-from jaxba.ba._leverage import Leverage, pixel_leverage, prior_leverages
 from jaxba.ba._linearise import Linearisation
 from jaxba.ba._plan_shape import num_rows
-from jaxba.ba._point_marginals import InverseBlocks, Joint, Squares, joint_marginals, point_marginals, squares
 from jaxba.ba._problem import Problem
 from jaxba.ba._system import System
-from jaxba.ba._track_scores import TrackSums, track_sums
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Call, Engine
+from jaxba.ba.uncertainty._leverage import Leverage, pixel_leverage, prior_leverages
+from jaxba.ba.uncertainty._point_marginals import (
+    InverseBlocks,
+    Joint,
+    Squares,
+    joint_marginals,
+    point_marginals,
+    squares,
+)
+from jaxba.ba.uncertainty._track_scores import TrackSums, track_sums
 
 Rows = Literal["none", "priors", "all"]
 """Whose leverages are asked for: of all rows those of the reprojections come first."""

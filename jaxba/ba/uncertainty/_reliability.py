@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtrc, ndtri
 
-from jaxba.ba._leverage import Leverage
+from jaxba.ba.uncertainty._leverage import Leverage
 
 SIGNIFICANCE, POWER = 0.001, 0.80
 NONCENTRALITY = float(ndtri(1 - SIGNIFICANCE / 2) + ndtri(POWER))

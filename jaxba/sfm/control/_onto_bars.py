@@ -23,11 +23,11 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import propagate
 from jaxba.geometry import Similarity
 from jaxba.scene import BarFit, Block, Control, ScaleBars
-from jaxba.sfm._bar_ends import BarEnds
-from jaxba.sfm._control_start import transformed
 from jaxba.sfm._measured import OUTLIER
 from jaxba.sfm._rounds import Solved
 from jaxba.sfm._spread import spread, weighed
+from jaxba.sfm.control._bar_ends import BarEnds
+from jaxba.sfm.control._start import transformed
 
 _LEAST_REDUNDANCY = 1e-6
 _ALIKE = 5e-3  # tests that differ by no more of the largest tell nothing of which is wrong

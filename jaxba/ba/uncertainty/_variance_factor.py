@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import chdtr, chdtrc, gammaincinv
 
-from jaxba.ba._point_marginals import Squares
+from jaxba.ba.uncertainty._point_marginals import Squares
 from jaxba.geometry import AbstractLoss, Linear
 
 _COUNTED = 0.99  # of errors whose squares count in full where the loss is robust

@@ -17,10 +17,7 @@ from jaxtyping import Float, Int
 from scipy.special import chdtrc
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._covariance import Covariance, Datum, Independent, marginals_at
-from jaxba.ba._leverage import Leverage
 from jaxba.ba._problem import AbstractPrior, Problem
-from jaxba.ba._reliability import RowStatistics, row_statistics
 from jaxba.ba._tables import (
     DataFrame,
     cameras_table,
@@ -31,9 +28,12 @@ from jaxba.ba._tables import (
     points_table,
     prior_table,
 )
-from jaxba.ba._variance_components import VarianceComponent, components_by, reweighted, variance_components
 from jaxba.ba.groups import ScaleBarPrior
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS
+from jaxba.ba.uncertainty._covariance import Covariance, Datum, Independent, marginals_at
+from jaxba.ba.uncertainty._leverage import Leverage
+from jaxba.ba.uncertainty._reliability import RowStatistics, row_statistics
+from jaxba.ba.uncertainty._variance_components import VarianceComponent, components_by, reweighted, variance_components
 from jaxba.geometry import AbstractLoss, Linear, require_number
 
 

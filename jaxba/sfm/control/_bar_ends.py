@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.ba import Free, Observations, Problem, with_scale_bars
 from jaxba.scene import Block, Control, ScaleBars
-from jaxba.sfm._control import ControlPart, agreeing_marks, image_rows, intersect, mark_std
+from jaxba.sfm.control._control import ControlPart, agreeing_marks, image_rows, intersect, mark_std
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """A block brought onto its control points, once these have been tested against it.
 
 The block as photos and positions make it says where its control points lie. That is compared with the survey and
-explained (`_control_explained.py`) before a surveyed coordinate may pull. Then the block is solved with what has stood
+explained (`_explained.py`) before a surveyed coordinate may pull. Then the block is solved with what has stood
 the test, and tested again there: by the Jacobians of the block where control holds it, what photos and positions alone
 say of the points is
 
@@ -27,14 +27,14 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import AbstractPrior, ControlPointPrior, PositionPrior, Problem, propagate
 from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control, Reference
-from jaxba.sfm._control import CONTROL_LOSS, Standing, after_tests
-from jaxba.sfm._control_explained import Explained, explain
-from jaxba.sfm._control_start import transformed
-from jaxba.sfm._control_statistics import Tested, control_statistics
 from jaxba.sfm._measured import common_std, flights_of, median_offset
-from jaxba.sfm._misclosure import Misclosure
 from jaxba.sfm._rounds import Solved
 from jaxba.sfm._spread import spread, weighed
+from jaxba.sfm.control._control import CONTROL_LOSS, Standing, after_tests
+from jaxba.sfm.control._explained import Explained, explain
+from jaxba.sfm.control._misclosure import Misclosure
+from jaxba.sfm.control._start import transformed
+from jaxba.sfm.control._statistics import Tested, control_statistics
 
 _log = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool
 
-from jaxba.sfm._misclosure import Misclosure, Mistake, Model, quantile
+from jaxba.sfm.control._misclosure import Misclosure, Mistake, Model, quantile
 
 MOST_SCALE = 10.0
 """Times its stated sigmas that a survey may be worse; beyond that it is wrong and not imprecise."""

@@ -13,20 +13,20 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._inner_constraints import free_block, num_free, of_photos_alone
-from jaxba.ba._leverage import Leverage
 from jaxba.ba._plan_shape import PlanShape, bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import rotation_matrices
 from jaxba.ba._system import own_unknowns
 from jaxba.ba._unknowns import Unknowns, antenna_names
-from jaxba.ba._variance_factor import variance_factor
 from jaxba.ba.checks import Dropped, prepare, require_gauge
 from jaxba.ba.tiles._dense import NotPositive
 from jaxba.ba.tiles._engine import Engine
 from jaxba.ba.tiles._inverse import Marginals, Rows, compile_marginals, marginals
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
 from jaxba.ba.tiles._right_hand_sides import solved
+from jaxba.ba.uncertainty._inner_constraints import free_block, num_free, of_photos_alone
+from jaxba.ba.uncertainty._leverage import Leverage
+from jaxba.ba.uncertainty._variance_factor import variance_factor
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
 Datum = Literal["priors", "inner"]

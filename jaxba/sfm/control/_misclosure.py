@@ -1,6 +1,6 @@
 """Misclosures of control with their covariance, and the columns that mistakes add to them.
 
-The formulas stand in `_control_explained.py`, which looks for the mistakes.
+The formulas stand in `_explained.py`, which looks for the mistakes.
 """
 
 from dataclasses import dataclass, replace

@@ -14,8 +14,8 @@ import numpy as np
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import Solution
 from jaxba.ba._solve import solve
-from jaxba.ba._statistics import Statistics, statistics
-from jaxba.ba._variance_components import reweighted
+from jaxba.ba.uncertainty._statistics import Statistics, statistics
+from jaxba.ba.uncertainty._variance_components import reweighted
 from jaxba.geometry import AbstractLoss, require_number
 
 _SETTLED = 0.02

@@ -25,12 +25,12 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.ba._linearise import masked_columns, scan_chunks
-from jaxba.ba._point_marginals import InverseBlocks, Joint
 from jaxba.ba._reweighting import reweighting
 from jaxba.ba._rows import rows_of, segments
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.groups import Reprojection
+from jaxba.ba.uncertainty._point_marginals import InverseBlocks, Joint
 
 
 class TrackSums(NamedTuple):

@@ -18,13 +18,13 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.ba._linearise import masked_columns, refined_columns, scan_chunks
-from jaxba.ba._point_marginals import InverseBlocks, Joint
 from jaxba.ba._priors import robust_rows
 from jaxba.ba._problem import AbstractPrior
 from jaxba.ba._rows import JacobianBlock, rows_of
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.groups import Reprojection
+from jaxba.ba.uncertainty._point_marginals import InverseBlocks, Joint
 from jaxba.geometry import Linear
 
 

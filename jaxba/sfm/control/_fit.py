@@ -4,7 +4,7 @@
 put it; all others are intersected from their marks by the adjusted poses.
 
 **Blunder test.** A control point in the adjustment is compared with what marks, photos, positions and the other control
-points say of it, and set aside where it contradicts them (`_control_explained.py`), a check point with where its marks
+points say of it, and set aside where it contradicts them (`_explained.py`), a check point with where its marks
 place it. The difference over its sigma is over 3.29 by chance in one of a thousand. What all check points are off in
 common (a GNSS base, a datum) is told as such and blamed on none of them. In a fit, whose parameters a wrong point
 bends, it is the standardised residual `v / sigma_v` with `sigma_v^2` the diagonal of `S - A (A^T S^-1 A)^-1 A^T`
@@ -25,11 +25,11 @@ from scipy.spatial import KDTree
 from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control, ControlFit, Reference
 from jaxba.sfm._adjust import Adjusted
-from jaxba.sfm._control import LEAST_TO_PLACE, Intersected, intersect
-from jaxba.sfm._control_start import determines_tilt, fit_similarity, transformed
-from jaxba.sfm._control_statistics import Tested
 from jaxba.sfm._measured import OUTLIER, median_offset
 from jaxba.sfm._uncertainty import Uncertainty, own_variance
+from jaxba.sfm.control._control import LEAST_TO_PLACE, Intersected, intersect
+from jaxba.sfm.control._start import determines_tilt, fit_similarity, transformed
+from jaxba.sfm.control._statistics import Tested
 
 LEAST_OF = {"helmert": 3, "affine": 4}
 _SHEAR = 0.01

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from jaxba.geometry import Similarity
 from jaxba.scene import Block, Control
 from jaxba.sfm._align import align, look_down
-from jaxba.sfm._control import LEAST_TO_PLACE, image_rows, intersect
 from jaxba.sfm._initialise import UNPLACED
 from jaxba.sfm._problem import is_collinear
+from jaxba.sfm.control._control import LEAST_TO_PLACE, image_rows, intersect
 
 _BENT = 0.005  # of the control's extent: what start values are good to
 _LOSS = 2.0  # sigmas

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.ba import NONCENTRALITY
-from jaxba.sfm._control_explained import Explained
-from jaxba.sfm._misclosure import UNSEEN, Misclosure, Mistake, Model
+from jaxba.sfm.control._explained import Explained
+from jaxba.sfm.control._misclosure import UNSEEN, Misclosure, Mistake, Model
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,13 +5,13 @@ from jaxtyping import Bool
 
 from jaxba.scene import Block, Control, ControlFit, Finding, Photo, Reference
 from jaxba.sfm._adjust import Adjusted
-from jaxba.sfm._control import LEAST_TO_PLACE, image_rows
-from jaxba.sfm._control_explained import MOST_SCALE, Explained
-from jaxba.sfm._control_fit import LEAST_OF
-from jaxba.sfm._control_start import determines_tilt
 from jaxba.sfm._measured import OUTLIER, used_positions
-from jaxba.sfm._misclosure import Mistake
 from jaxba.sfm._problem import is_collinear
+from jaxba.sfm.control._control import LEAST_TO_PLACE, image_rows
+from jaxba.sfm.control._explained import MOST_SCALE, Explained
+from jaxba.sfm.control._fit import LEAST_OF
+from jaxba.sfm.control._misclosure import Mistake
+from jaxba.sfm.control._start import determines_tilt
 
 _OFFSET = 3.0  # sigmas of a position, after a fit
 _HEIGHT_UNITS = {"feet as metres": 0.3048, "metres as feet": 1 / 0.3048}  # true heights over those of the list

@@ -15,10 +15,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool
 
-from jaxba.ba._point_marginals import Squares
 from jaxba.ba._problem import Problem
-from jaxba.ba._reliability import RowStatistics
-from jaxba.ba._variance_factor import variance_factor
+from jaxba.ba.uncertainty._point_marginals import Squares
+from jaxba.ba.uncertainty._reliability import RowStatistics
+from jaxba.ba.uncertainty._variance_factor import variance_factor
 from jaxba.geometry import AbstractLoss
 
 LEAST_REDUNDANCY = 8.0

@@ -1,0 +1,1 @@
+"""How well an adjustment knows its unknowns, and what measurements say of each other: covariances, tests, weights."""

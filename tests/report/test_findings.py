@@ -468,7 +468,7 @@ def test_counts_of_a_sentence_are_written_alike():
 
 def test_every_kind_that_can_be_found_has_words_and_a_case():
     folder = Path(jaxba.__file__).parent / "sfm"
-    sources = "".join(path.read_text() for path in folder.glob("*findings.py"))
+    sources = "".join(path.read_text() for path in folder.rglob("*findings.py"))
     found = set(re.findall(r'Finding\.of\(\s*"([^"]+)"', sources))
     assert found == set(WORDS) == {finding.kind for finding, _ in CASES}
 

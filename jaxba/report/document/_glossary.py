@@ -6,14 +6,14 @@ GLOSSARY = {
         "measurement is met as well as their sigmas allow (least squares, with a loss that lets go of errors)."
     ),
     "Sigma": (
-        "By how much a value is expected to be wrong: two of three errors are smaller, nineteen of twenty are under "
-        "twice the sigma. Sigmas here are those of the adjustment: they follow from the geometry of the block and "
-        "from how far its measurements scatter, and hold what all measurements are off in common only where something "
-        "tells it."
+        "By how much a value is expected to be wrong, as far as the measurements can show it: two of three errors "
+        "are smaller, nineteen of twenty are under twice the sigma. Sigmas here are those of the adjustment: they "
+        "follow from the geometry of the block and from how far its measurements scatter, and hold what all "
+        "measurements are off in common only where something tells it."
     ),
     "Error ellipse": (
-        "Where a place is known differently in different directions, its sigma is an ellipse. Drawn are those of one "
-        "sigma in the plane, which hold the truth in 39% of cases."
+        "Where a place is known differently in different directions, its sigma is an ellipse. Drawn are those of "
+        "one sigma in the plane, which hold the truth in 39% of cases."
     ),
     "Reprojection error": (
         "Distance in the photo, in pixels, between a measured image point and the place where the adjusted camera "
@@ -21,13 +21,13 @@ GLOSSARY = {
     ),
     "Limit of errors": (
         "Image points are rejected where their error is over the median by more than a factor times the median "
-        "absolute deviation (MAD), since errors so large come from wrong matches: adjust.mad_factor. The limit is not "
-        "under 3.5 sigmas, nor where the loss begins to let go (adjust.f_scale), nor over adjust.track_threshold. "
-        "Points of few photos are held to less, since they fit better by chance."
+        "absolute deviation (MAD), since errors so large come from wrong matches: adjust.mad_factor. The limit is "
+        "not under 3.5 sigmas, nor where the loss begins to let go (adjust.f_scale), nor over "
+        "adjust.track_threshold. Points of few photos are held to less, since they fit better by chance."
     ),
     "Systematic residuals": (
-        "Residuals averaged over each part of the sensor, and along the radius. Where the camera model fits the lens, "
-        "what is left has no pattern."
+        "Residuals averaged over each part of the sensor, and along the radius. Where the camera model fits the "
+        "lens, what is left has no pattern."
     ),
     "Ground sample distance": "Side of a pixel on the ground: height above ground over focal length, in the median.",
     "Intrinsics": (
@@ -39,8 +39,10 @@ GLOSSARY = {
         "and each of them badly."
     ),
     "Positions of photos": (
-        "Residuals are adjusted minus measured. The measured ones count with the sigmas that the photos or lists "
-        "state, enlarged where they scatter by more; positions that contradict the block are let go of."
+        "Residuals are adjusted minus measured. Measured positions count with the sigmas that the photos or lists "
+        "state, changed to what they scatter by: larger where they contradict the block; smaller, down to a tenth, "
+        "for a single receiver, most of whose error all photos have in common and which is not in them. Positions "
+        "that contradict the block are let go of."
     ),
     "Offset in common": (
         "What all measured positions are off alike, as a base at a wrong place makes them. Without control points "
@@ -51,8 +53,8 @@ GLOSSARY = {
         "contradicts the others is set aside and named."
     ),
     "Check point": (
-        "A surveyed point that takes no part in the adjustment and is compared with the result: the only independent "
-        "statement of accuracy."
+        "A surveyed point that takes no part in the adjustment and is compared with the result: the only "
+        "independent statement of accuracy."
     ),
     "Over sigma": (
         "Difference between the survey of a point and what all else says of it, over the sigma of that difference; "
@@ -68,8 +70,8 @@ GLOSSARY = {
         "How many measurements there are beyond those that are needed. Where it is small, errors do not show."
     ),
     "Variance component": (
-        "How far one kind of measurement really scatters, from its residuals and its redundancy (Helmert, Foerstner), "
-        "beside the sigma that it was taken with."
+        "How far one kind of measurement really scatters, from its residuals and its redundancy (Helmert, "
+        "Foerstner), beside the sigma that it was taken with."
     ),
     "Variance factor": "Squared residuals over their sigmas, a redundant measurement: 1 where sigmas are right.",
     "ASPRS accuracy": (
@@ -78,8 +80,8 @@ GLOSSARY = {
     ),
     "Scale bar": "A measured distance between two marked points. It is tested against all else before it may pull.",
     "Overlap": (
-        "Photos that see the middle of a cell of the ground, by the adjusted cameras. Points of fewer than three are "
-        "weak."
+        "Photos that see the middle of a cell of the ground, by the adjusted cameras. Points of fewer than three "
+        "are weak."
     ),
     "Traffic light": "A figure held against limits that stand beside it. They are customs of the trade, not a promise.",
 }

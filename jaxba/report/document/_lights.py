@@ -111,7 +111,8 @@ def _focal(material: Material) -> dict[str, Any]:
     change, camera = max(_focal_changes(material), default=(np.nan, 0))
     if not np.isfinite(change):
         return _unknown("Change of focal length", "No photo states its focal length.", limits)
-    text = f"The focal length that the tags of {block.camera_names[camera]} lead to is changed by so much at most."
+    focal = float(block.camera_parameters[camera, 0])
+    text = f"{block.camera_names[camera]}: {focal:.0f} px as adjusted, against what the photos' tags lead to."
     return _row("Change of focal length", f"{change:.2%}", _low(change, _FOCAL), text, limits)
 
 

@@ -20,8 +20,9 @@ def residuals(material: Material) -> dict[str, Any]:
         return {"none": NOT_ADJUSTED}
     length = errors.length_px
     known = np.isfinite(length)
-    median = float(np.median(length[known]))
-    mad = float(np.median(np.abs(length[known] - median)))
+    used = length[known & errors.is_used]
+    median = float(np.median(used))
+    mad = float(np.median(np.abs(used - median)))
     limit = float(adjusted.limit_px)
     edges = np.linspace(0.0, _WIDEST * (limit if np.isfinite(limit) else float(length[known].max())), _BINS + 1)
     inside = np.minimum(length, edges[-1] * (1 - 1e-12))

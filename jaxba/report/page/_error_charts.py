@@ -67,9 +67,9 @@ def histogram(report: dict[str, Any]) -> Figure | None:
     robust = "" if found["mad_px"] is None else f" (median absolute deviation {found['mad_px']:.2f} px)"
     return Figure(
         name="histogram", title="How large the errors are", height_px=360, data=bars, layout=layout,
-        caption="How far image points lie from where the result has them. An error over the limit, which follows "
-        f"from the spread of all of them{robust}, is taken for a wrong match; points of few photos are held to less. "
-        "The last bar holds all that lies beyond.",
+        caption="How far image points lie from where the computed cameras and points put them. An error over the limit "
+        f"is taken for a wrong match. The limit follows from the spread of all errors{robust} within bounds that the "
+        "glossary names; points of few photos are held to less. The last bar holds all that lies beyond.",
     )  # fmt: skip
 
 
@@ -169,8 +169,8 @@ def correlation(report: dict[str, Any]) -> Figure | None:
     return Figure(
         name="correlation", title="Correlation of the parameters", height_px=min(240 + 32 * len(names), 900),
         data=[heat], layout=layout,
-        caption="Two parameters with a correlation near 1 or -1 cannot be told apart by these photos: each may be "
-        "off as long as the other makes up for it. Values near 0 are what one wishes for.",
+        caption="Of two parameters with a correlation near 1 or -1 the photos know mainly a combination. That fx and "
+        "fy go together is usual; what matters is whether the sigmas in the table above are small.",
     )  # fmt: skip
 
 

@@ -124,8 +124,8 @@ def overlap_map(report: dict[str, Any]) -> Figure | None:
     return Figure(
         name="overlap", title="Photos that see each piece of ground", ratio=area.ratio, data=data, layout=area.layout(),
         caption="Where the map is blue, four photos or more see the ground, so that an error in one of them is "
-        "noticed. Orange ground is seen by three at most; where it is dark, by one or two, and is not to be relied "
-        "on.",
+        "noticed. Pale orange is seen by three; orange and dark orange, seen by two and by one, are not to be relied "
+        "on. Where it is white, no photo sees the ground.",
     )  # fmt: skip
 
 

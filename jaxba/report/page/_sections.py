@@ -150,7 +150,7 @@ def _statistics(found: dict[str, Any]) -> list[Block]:
     factor = found["variance_factor"]
     return [
         f"Redundancy of the whole adjustment: {number(found['redundancy'], 0)}. Variance factor: {number(factor, 2)}. "
-        "A sigma that was found well above the sigma that was assumed says that these measurements are worse than they "
+        "A sigma that was found well above the sigma that was stated says that these measurements are worse than they "
         "were taken to be.",
         statistics_table(found),
     ]

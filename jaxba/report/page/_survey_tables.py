@@ -35,7 +35,8 @@ def position_tables(found: dict[str, Any]) -> list[Table]:
 
 def attitude_table(found: dict[str, Any]) -> Table:
     """Return the differences from the recorded attitudes."""
-    columns = [text("angle"), Column(name="mean difference", unit="°"), Column(name="RMS difference", unit="°")]
+    figures = ("mean, adjusted - recorded", "RMS, adjusted - recorded")
+    columns = [text("angle"), *(Column(name=name, unit="°") for name in figures)]
     rows = zip(found["names"], found["mean_deg"], found["rms_deg"], strict=True)
     return table(f"{found['num']:,} attitudes", columns, rows, digits=2)
 
@@ -103,8 +104,8 @@ def bar_table(found: dict[str, Any]) -> Table:
 def statistics_table(found: dict[str, Any]) -> Table:
     """Return the kinds of observations with the sigmas that the block itself gives them."""
     columns = [
-        text("measurements"), Column(name="count"), Column(name="redundancy"), text("unit"),
-        Column(name="sigma assumed"),
+        text("measurements"), Column(name="coordinates"), Column(name="redundancy"), text("unit"),
+        Column(name="sigma as stated"),
         Column(name="sigma found"), Column(name="its own sigma", unit="%"), text("reliable"),
     ]  # fmt: skip
     rows = [

@@ -7,8 +7,9 @@ jax's cache folder is for, and the function with the shapes and static fields of
 is (`jax_compilation_cache_dir`), and not at all without one, off the CPU, or where a class or function from elsewhere
 takes part, whose source nobody has read.
 
-On trial, and therefore only where the environment says `JAXBA_KEEP_PROGRAMS=1`: of 820 programs that were kept, three
-lacked a part of their code when another process called them, and it is not known why.
+On trial, and therefore only where the environment says `JAXBA_KEEP_PROGRAMS=1`. An executable that jax has read from
+its cache lacks a part of its code when it is written again, and fails only when another process calls it; jax also
+keeps it in memory, where it tells of no hit. So nothing is written but what jax tells that it has compiled just now.
 """
 
 import functools
@@ -80,9 +81,9 @@ def program(
         path = known.with_name(_digest(text, taken, repr((options, settings, _versions())).encode()) + _CODE)
         made = _loaded(path, arguments, traced.out_info)
         if made is None:
-            before = _OF_JAX.hits
+            before = _COMPILED.count
             made = lowered.compile(compiler_options=options)
-            if _OF_JAX.hits > before:  # from jax's own cache: such a program cannot be written again
+            if _COMPILED.count == before:  # had by jax, on the disk or in memory: what was read cannot be written again
                 return made
             _write(path, lambda: zlib.compress(serialize_executable.serialize(made)[0], level=1))
         _write(known, lambda: _pickled((path.name, _shapes(traced.out_info))))
@@ -156,17 +157,17 @@ def _source() -> bytes:
     return digest.digest()
 
 
-class _OfJax(threading.local):
-    """Counts what this thread had from jax's cache."""
+class _Compiled(threading.local):
+    """Counts what jax has compiled and written in this thread; what it has in memory it does not tell of."""
 
-    hits = 0
+    count = 0
 
     def __call__(self, event: str, **_: Any) -> None:
-        self.hits += event == "/jax/compilation_cache/cache_hits"
+        self.count += event == "/jax/compilation_cache/cache_misses"
 
 
-_OF_JAX = _OfJax()
-jax.monitoring.register_event_listener(_OF_JAX)
+_COMPILED = _Compiled()
+jax.monitoring.register_event_listener(_COMPILED)
 
 
 def _read(known: Path, arguments: tuple[Any, ...]) -> Program | None:

@@ -1,6 +1,7 @@
 """Programs on the disk: a later process traces nothing, and no program is taken for another one."""
 
 import errno
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -114,6 +115,19 @@ def test_code_from_elsewhere_is_kept_by_no_name(folder: Path, monkeypatch: pytes
     monkeypatch.setattr(_kept_programs, "_READ", ())
     _forget()
     assert call_compiled(_of_module, given).tolist() == [2.0] * 3 and _kept(folder) == 1
+
+
+def test_what_jax_had_compiled_before_is_not_written_however_often_it_is_asked_for(folder: Path) -> None:
+    # breaks where an executable that was read, which lacks a part of its code when it is written, is kept: the second
+    # time jax has it in memory and tells of no hit
+    call_compiled(_doubled, np.ones(3))
+    shutil.rmtree(folder)
+    compilation_cache.reset_cache()
+    jax.clear_caches()  # like a process that finds jax's cache alone
+    for _ in range(3):
+        _forget()
+        assert call_compiled(_doubled, np.ones(3)).tolist() == [2.0] * 3
+        assert not list(folder.glob("*.code"))
 
 
 @pytest.mark.parametrize("suffix", ["", ".code"])

@@ -69,7 +69,8 @@ def histogram(report: dict[str, Any]) -> Figure | None:
         name="histogram", title="How large the errors are", height_px=360, data=bars, layout=layout,
         caption="How far image points lie from where the computed cameras and points put them. An error over the limit "
         f"is taken for a wrong match. The limit follows from the spread of all errors{robust} within bounds that the "
-        "glossary names; points of few photos are held to less. The last bar holds all that lies beyond.",
+        "glossary names; points of few photos are held to less. The last bar holds all that lies beyond. Rejected ones "
+        "whose point was rejected as well have no error to be drawn.",
     )  # fmt: skip
 
 

@@ -31,6 +31,7 @@ from jaxba.ba.tiles._batch import solve_batch
 from jaxba.ba.tiles._merge import Merged, MergedTile, merge_tiles
 from jaxba.ba.tiles._partition import BlockTile, Partition, partition
 from jaxba.ba.tiles._solve_tiled import solve_tiled
+from jaxba.ba.uncertainty._camera_covariance import camera_covariance
 from jaxba.ba.uncertainty._covariance import Covariance, covariance
 from jaxba.ba.uncertainty._propagate import Propagated, propagate
 from jaxba.ba.uncertainty._reliability import NONCENTRALITY, RowStatistics
@@ -82,6 +83,7 @@ __all__ = [
     "Tuned",
     "Unknowns",
     "VarianceComponent",
+    "camera_covariance",
     "check_gradients",
     "covariance",
     "fast_jit",

@@ -294,6 +294,29 @@ def report(
     return make_report(project, show=open_, as_json=json)
 
 
+@app.command(
+    help="Tell what a flight would give before it is flown: sigmas over the area, how the block may be bent, what "
+    "oblique photos, a second height, RTK or control would gain. Of a project the same, from its own adjustment.\n\n"
+    "Exit codes: 0 told, 2 bad input or options."
+)
+def plan(
+    plan_: Annotated[
+        Path, Parameter(name="PLAN", help="A flight's plan, flight.toml, or the project folder of a run.")
+    ],
+    /,
+    *,
+    improve: Annotated[
+        Literal["control"] | None, Parameter(help="Find the places where control points help most.")
+    ] = None,
+    points: Annotated[int, Parameter(help="How many control points to place.")] = 4,
+    json: _Json = False,
+    quiet: Annotated[bool, Parameter(negative="", show_default=False, help="Print nothing.")] = False,
+) -> int:
+    from jaxba.cli._plan import run
+
+    return run(plan_, improve=improve, points=points, as_json=json, quiet=quiet)
+
+
 @app.command(help="Print a jaxba.toml with every parameter: its default, range and one line of meaning.")
 def config(
     file: Annotated[Path | None, Parameter(help="Print the settings of this file. [default: jaxba.toml here]")] = None,

@@ -14,12 +14,20 @@ _TITLES = ("step", "cost", "change", "gradient", "length", "trust", "linear", "s
 def line() -> Iterator[Callable[[HistoryStep], None]]:
     """Yield a callback that shows the present step on standard error, a terminal; the line is gone afterwards."""
 
+    with overwritten() as show:
+        show("preparing and compiling ...")
+        yield lambda s: show(f"step {s.step}   cost {s.cost:.6g}   change {s.change:.2e}   {s.seconds:.1f} s")
+
+
+@contextmanager
+def overwritten() -> Iterator[Callable[[str], None]]:
+    """Yield what shows a text on standard error, a terminal, in place of the one before; it is gone afterwards."""
+
     def show(text: str) -> None:
         print(f"{_CLEAR}{text}", end="", file=sys.stderr, flush=True)
 
-    show("preparing and compiling ...")
     try:
-        yield lambda s: show(f"step {s.step}   cost {s.cost:.6g}   change {s.change:.2e}   {s.seconds:.1f} s")
+        yield show
     finally:
         show("")
 

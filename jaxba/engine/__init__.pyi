@@ -8,6 +8,7 @@ from ._settings import (
     changed as changed,
     explained as explained,
     from_toml as from_toml,
+    set_from_tables as set_from_tables,
     to_toml as to_toml,
 )
 from ._stage import Item as Item, Pipeline as Pipeline, Stage as Stage

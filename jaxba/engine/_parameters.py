@@ -83,8 +83,8 @@ def parse(cls: type[Parameters], name: str, text: str) -> Any:
 
 
 def stage_name(cls: type[Parameters]) -> str:
-    """Return the name of the stage or section whose parameters these are: that of its module."""
-    return cls.__module__.rpartition(".")[2].lstrip("_")
+    """Return the name of the stage or section whose parameters these are: its own, or that of its module."""
+    return getattr(cls, "section", "") or cls.__module__.rpartition(".")[2].lstrip("_")
 
 
 def _check(cls: type[Parameters], field: dataclasses.Field, value: Any) -> None:

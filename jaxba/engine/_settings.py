@@ -55,15 +55,20 @@ def from_toml(path: Path, settings: Settings) -> dict[str, Parameters]:
         raise JaxbaError(
             f"{path}: is not valid TOML ({error}); write tables such as [match] and lines ratio = 0.7."
         ) from None
-    result = dict(settings)
     try:
-        for section, table in tables.items():
-            if section not in result or not isinstance(table, dict):
-                raise _unknown_section(section, result)
-            for name, value in table.items():
-                _set(result, section, name, value)
+        return set_from_tables(settings, tables)
     except JaxbaError as error:
         raise JaxbaError(f"{path}: {error}") from None
+
+
+def set_from_tables(settings: Settings, tables: Mapping[str, Any]) -> dict[str, Parameters]:
+    """Return the settings with those of the tables of a TOML file."""
+    result = dict(settings)
+    for section, table in tables.items():
+        if section not in result or not isinstance(table, dict):
+            raise _unknown_section(section, result)
+        for name, value in table.items():
+            _set(result, section, name, value)
     return result
 
 

@@ -1,5 +1,12 @@
 from . import photos as photos, synthetic as synthetic
-from ._flight import Terrain as Terrain, flight_plan as flight_plan, smooth_terrain as smooth_terrain
+from ._flight import (
+    Images as Images,
+    Terrain as Terrain,
+    field_of_view as field_of_view,
+    flight_plan as flight_plan,
+    make_tracks as make_tracks,
+    smooth_terrain as smooth_terrain,
+)
 from ._ground import Ground as Ground, paint_ground as paint_ground
 from ._render import (
     expose as expose,

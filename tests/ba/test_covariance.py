@@ -15,7 +15,17 @@ from scipy.stats import chi2
 from small_problems import one_of, two_flights
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import Covariance, IntrinsicsPrior, Observations, Problem, Step, covariance, solve, statistics
+from jaxba.ba import (
+    Covariance,
+    IntrinsicsPrior,
+    Observations,
+    Problem,
+    Step,
+    camera_covariance,
+    covariance,
+    solve,
+    statistics,
+)
 from jaxba.ba._unknowns import antenna_names
 from jaxba.geometry import AbstractLoss, Cauchy, Huber, Linear
 from jaxba.simulation import Survey, uav_block
@@ -164,6 +174,14 @@ def test_covariances_equal_a_dense_inverse(case: str, num_tiles: int):
     assert_same(found.border, dense.of(np.array([by_name[name] for name in found.border_names], int)))
     assert found.redundancy == dense.redundancy
     assert found.variance_factor == pytest.approx(dense.variance_factor, rel=1e-6)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_joint_covariance_of_cameras_is_a_part_of_the_dense_inverse(case: str):
+    """It breaks where images or cameras are out of order, or what lies between those of two images is lost."""
+    problem, loss, dense = case_and_dense(case)
+    place = np.append(dense.step.poses.ravel(), dense.step.intrinsics.ravel()).astype(int)
+    assert_same(camera_covariance(problem, loss=loss), dense.of(place))
 
 
 @pytest.mark.parametrize("num_tiles", [1, 3])

@@ -13,6 +13,8 @@ import pytest
 import jaxba
 from jaxba.cli import main
 from jaxba.cli._main import app
+from jaxba.design import sections as plan_sections
+from jaxba.engine import explained
 
 ROOT = Path(jaxba.__file__).parents[1]
 READMES = sorted({ROOT / "README.md", ROOT / "benchmarks" / "README.md", *(ROOT / "jaxba").rglob("README.md")})
@@ -122,6 +124,7 @@ def test_parameters_exist(readme: Path, capsys: pytest.CaptureFixture[str], tmp_
     with pytest.raises(SystemExit):
         main(["config", "--json"])
     known = {row["name"] for row in json.loads(capsys.readouterr().out)["parameters"]}
+    known |= {name for name, *_ in explained(plan_sections())}
     sections = "|".join({name.partition(".")[0] for name in known})
     text, _, _ = readme.read_text(encoding="utf-8").partition("| field | meaning |")  # of report.json, not parameters
     named = re.findall(rf"(?<![\w./])((?:{sections})\.([a-z_]+))\b(?!\()", text)

@@ -301,10 +301,13 @@ def report(
 )
 def plan(
     plan_: Annotated[
-        Path, Parameter(name="PLAN", help="A flight's plan, flight.toml, or the project folder of a run.")
-    ],
+        Path | None, Parameter(name="PLAN", help="A flight's plan, flight.toml, or the project folder of a run.")
+    ] = None,
     /,
     *,
+    example: Annotated[
+        bool, Parameter(negative="", show_default=False, help="Print a plan with every parameter, to begin with.")
+    ] = False,
     improve: Annotated[
         Literal["control"] | None, Parameter(help="Find the places where control points help most.")
     ] = None,
@@ -312,6 +315,13 @@ def plan(
     json: _Json = False,
     quiet: Annotated[bool, Parameter(negative="", show_default=False, help="Print nothing.")] = False,
 ) -> int:
+    if example:
+        from jaxba.design import example as example_of_plan
+
+        print(example_of_plan(), end="")
+        return 0
+    if plan_ is None:
+        raise JaxbaError("plan: give a flight's plan or a project; jaxba plan --example prints a plan to begin with.")
     from jaxba.cli._plan import run
 
     return run(plan_, improve=improve, points=points, as_json=json, quiet=quiet)

@@ -1,4 +1,4 @@
-from ._flight_plan import FlightPlan as FlightPlan, read_plan as read_plan
+from ._flight_plan import FlightPlan as FlightPlan, example as example, read_plan as read_plan, sections as sections
 from ._flown import network_of_block as network_of_block
 from ._forecast import forecast as forecast, gains as gains, improved as improved
 from ._modes import Mode as Mode, dome_std_m as dome_std_m, shift_std_m as shift_std_m, weakest_modes as weakest_modes

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from jaxba._errors import JaxbaError
 from jaxba.design._place import Place
 from jaxba.design._sections import Camera, Control, Flight, Gnss, Ground, Ties
-from jaxba.engine import Parameters, set_from_tables
+from jaxba.engine import Parameters, set_from_tables, to_toml
 from jaxba.io import text_of
 
 _SECTIONS = (Camera, Flight, Gnss, Ties, Ground, Control)
@@ -91,13 +91,12 @@ def _plan_of(tables: dict[str, Any]) -> FlightPlan:
         raise JaxbaError(f'area.crs={crs}: give a text, such as "EPSG:32615".')
     control = tables.get("control")
     points = control.pop("points", []) if isinstance(control, dict) else []
-    defaults: dict[str, Parameters] = {section.section: section() for section in _SECTIONS}
-    sections: dict[str, Any] = set_from_tables(defaults, tables)
+    known: dict[str, Any] = set_from_tables(sections(), tables)
     polygon = _pairs("area.polygon", area["polygon"], least=3)
     place, area_m = Place.of(polygon, crs)
     _refuse_polygon(area_m)
     control_m = place.local(_pairs("control.points", points, least=0))
-    return FlightPlan(area_m=area_m, place=place, control_m=control_m, **sections)
+    return FlightPlan(area_m=area_m, place=place, control_m=control_m, **known)
 
 
 def _pairs(name: str, given: Any, *, least: int) -> Float[np.ndarray, "n 2"]:
@@ -123,3 +122,22 @@ def _refuse_polygon(area_m: Float[np.ndarray, "corners 2"]) -> None:
             f"area.polygon has {polygon.area:.2g} square metres, which is none to fly; for degrees of longitude and "
             'latitude write crs = "EPSG:4326" beside it.'
         )
+
+
+def example() -> str:
+    """Return a plan to begin with: a square, and every parameter with its default, range and meaning."""
+    area = [
+        "[area]",
+        "# corners, x (or longitude) first",
+        "polygon = [[0, 0], [300, 0], [300, 200], [0, 200]]",
+        "# of the coordinates; without it they are metres",
+        '# crs = "EPSG:32615"',
+        "",
+    ]
+    control = ["# places of control points, in the same coordinates", "# points = [[10, 10], [290, 190]]", ""]
+    return "\n".join(area) + "\n" + to_toml(sections(), explain=True) + "\n".join(control)
+
+
+def sections() -> dict[str, Parameters]:
+    """Return the tables of a plan with their defaults."""
+    return {section.section: section() for section in _SECTIONS}

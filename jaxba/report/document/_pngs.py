@@ -90,15 +90,15 @@ def _map(figure: "Figure", facts: Facts) -> None:
 def _matches(figure: "Figure", facts: Facts) -> None:
     from matplotlib.collections import LineCollection
 
-    places = _places(facts)
+    places, found = _places(facts), facts["pairs"]
+    ends, states = np.array([found["first"], found["second"]]).T, np.array(found["state"])
     axes = _map_axes(figure, facts, places)
     for state, (colour, width) in _STATES.items():
-        mine = [pair for pair in facts["pairs"] if pair["state"] == state]
-        lines = np.array([[places[pair["first"]], places[pair["second"]]] for pair in mine]).reshape(-1, 2, 2)
+        lines = places[ends[states == state]]
         axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=width, alpha=0.5, label=state))
     axes.scatter(*places.T, s=14, color=INK, zorder=3)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
-    counts = [sum(pair["state"] == state for pair in facts["pairs"]) for state in (*_STATES, "rejected")]
+    counts = [found["state"].count(state) for state in (*_STATES, "rejected")]
     titles(figure, "Pairs of photos with matches", "{} good, {} weak, {} pruned; {} rejected ones".format(*counts))
 
 

@@ -17,6 +17,7 @@ from jaxba.report.page._survey_tables import (
     bar_table,
     control_tables,
     position_tables,
+    sigma_blocks,
     statistics_table,
 )  # fmt: skip
 from jaxba.report.page._tables import Table, number
@@ -55,14 +56,15 @@ def sections(report: dict[str, Any]) -> list[Section]:
         _section(
             "positions-map", "Cameras and their accuracy",
             no_photos or (None if sigmas else "No photo has a place, neither by GNSS nor by the adjustment."),
-            sigmas, residual_map(report),
+            *_of(report["sigmas"], sigma_blocks), sigmas, residual_map(report),
         ),
         _section("overlap", "Overlap", _none(report["overlap"], "rows", "No photo sees the ground."),
                  overlap_map(report)),
         _section(
             "matches", "Matches between photos",
-            None if matches else "No photos that have a place were matched with each other.",
-            matches, _told_pairs(report),
+            _none(report["pairs"])
+            or (None if matches else "No photos that have a place were matched with each other."),
+            matches, _told_pairs(report) if matches else None,
         ),
         _section("space", "The block in three dimensions", no_points, in_space(report)),
         _section(
@@ -122,7 +124,7 @@ def _or_reason(found: dict[str, Any], figure: Figure | None) -> Iterable[Block]:
 
 def _told_pairs(report: dict[str, Any]) -> str:
     """Return how many pairs there are of each state."""
-    states = [pair["state"] for pair in report["pairs"]]
+    states = report["pairs"]["state"]
     counts = [(state, states.count(state)) for state in ("good", "weak", "rejected", "pruned")]
     return f"Of {len(states):,} pairs of photos: " + ", ".join(f"{count:,} {state}" for state, count in counts) + "."
 

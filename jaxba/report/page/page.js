@@ -4,7 +4,7 @@
 (() => {
   const root = document.documentElement;
   const PRINT_WIDTH = 680; // of A4 within its margins, in pixels of CSS
-  const HIGHEST = 540, HIGHEST_ON_PAPER = 275; // of the room inside the axes; two figures go on a page
+  const HIGHEST = 540, HIGHEST_ON_PAPER = 620; // of the room inside the axes; a map is as wide as the page
   const COLOURS = ["ink", "muted", "grid", "paper", "blue", "step-1", "step-2", "step-3", "step-4"];
   // named one by one, since Plotly's own choice has a button that sends the figure to a server
   const BUTTONS = ["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"];
@@ -38,7 +38,7 @@
     if (Array.isArray(value)) {
       return typeof value[0] === "object" && value[0] !== null ? value.map((one) => coloured(one, key, colours)) : value;
     }
-    if (value === null || typeof value !== "object") return value;
+    if (value === null || typeof value !== "object" || ArrayBuffer.isView(value)) return value;
     return Object.fromEntries(Object.entries(value).map(([name, one]) => [name, coloured(one, name, colours)]));
   }
 
@@ -82,10 +82,30 @@
     return [traces, made];
   }
 
+  // lines between places: the page has their numbers alone, since a block of 500 photos has 10,000 pairs
+  const TYPES = { f8: Float64Array, u4: Uint32Array, u2: Uint16Array };
+  function unpacked({ dtype, bdata }) {
+    return new TYPES[dtype](Uint8Array.from(atob(bdata), (letter) => letter.charCodeAt(0)).buffer);
+  }
+  function joinPlaces({ data, places }) {
+    if (!places) return;
+    const xy = unpacked(places);
+    for (const trace of data) {
+      if (!trace.ends) continue;
+      const ends = unpacked(trace.ends);
+      delete trace.ends;
+      for (const [axis, letter] of ["x", "y"].entries()) {
+        trace[letter] = new Float64Array(1.5 * ends.length).fill(NaN); // a gap after each line
+        for (let k = 0; k < ends.length; k += 1) trace[letter][k + (k >> 1)] = xy[2 * ends[k] + axis];
+      }
+    }
+  }
+
   function draw(figure) {
     figure.drawn ??= (async () => {
       try {
         figure.parts = JSON.parse(figure.text);
+        joinPlaces(figure.parts);
         const [traces, layout] = prepared(figure);
         await Plotly.newPlot(figure.plot, traces, layout, {
           displaylogo: false, responsive: false, displayModeBar: touch.matches ? false : "hover",

@@ -246,10 +246,17 @@ def test_a_browser_draws_every_figure_and_asks_for_nothing(full: str, tmp_path: 
         pytest.skip("needs Chromium, and there is none on the PATH")
     path = tmp_path / "report.html"
     path.write_text(full, "utf-8")
-    flags = [
+    flags = [  # a window that shows all of it, since the points in space wait until they are looked at
         *("--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"),
         *("--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"),
-        *("--disable-sync", "--enable-logging=stderr", "--v=0", "--virtual-time-budget=30000", "--dump-dom"),
+        *(
+            "--window-size=1200,30000",
+            "--disable-sync",
+            "--enable-logging=stderr",
+            "--v=0",
+            "--virtual-time-budget=30000",
+            "--dump-dom",
+        ),
     ]
     done = subprocess.run(
         [found, *flags, f"--user-data-dir={tmp_path / 'profile'}", path.as_uri()],

@@ -1,6 +1,7 @@
 "use strict";
 // Draws the figures, follows light, dark and paper, and lets tables be sorted. What can be asked from outside:
-// `reportDrawn` is true once every figure has been drawn; `drawAll()` draws what is left and promises to be done.
+// `reportDrawn` is true once every figure has been drawn, but for what waits until it is looked at; `drawAll()` draws
+// what is left and promises to be done.
 (() => {
   const root = document.documentElement;
   const PRINT_WIDTH = 680; // of A4 within its margins, in pixels of CSS
@@ -40,6 +41,15 @@
     }
     if (value === null || typeof value !== "object" || ArrayBuffer.isView(value)) return value;
     return Object.fromEntries(Object.entries(value).map(([name, one]) => [name, coloured(one, name, colours)]));
+  }
+
+  // whether WebGL has no graphics card, and computes each pixel
+  function isSoftware() {
+    const gl = document.createElement("canvas").getContext("webgl");
+    const info = gl?.getExtension("WEBGL_debug_renderer_info");
+    const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+    gl?.getExtension("WEBGL_lose_context")?.loseContext();
+    return /swiftshader|llvmpipe|software|basic render/i.test(name);
   }
 
   // data and layout for the width that there is now
@@ -110,6 +120,7 @@
         await Plotly.newPlot(figure.plot, traces, layout, {
           displaylogo: false, responsive: false, displayModeBar: touch.matches ? false : "hover",
           modeBarButtons: [layout.scene ? BUTTONS_IN_SPACE : BUTTONS], plotlyServerURL: "",
+          plotGlPixelRatio: layout.scene && isSoftware() ? 1 : 2,
           toImageButtonOptions: { filename: figure.element.id.slice(2), scale: 2 },
         });
       } catch (error) {
@@ -122,25 +133,24 @@
   const redraw = (figure) => figure.parts && Plotly.react(figure.plot, ...prepared(figure));
   const redrawAll = () => figures.forEach(redraw);
 
-  window.drawAll = async () => {
-    await Promise.all(figures.map(draw));
-    window.reportDrawn = true;
-    root.dataset.drawn = "true";
-  };
+  window.drawAll = () => Promise.all(figures.map(draw));
 
   // figures near the window first, then the others one by one while the reader reads
   const near = new IntersectionObserver((entries) => {
     for (const entry of entries) if (entry.isIntersecting) draw(figures.find((figure) => figure.plot === entry.target));
   }, { rootMargin: "600px" });
   figures.forEach((figure) => near.observe(figure.plot));
-  const pause = () => new Promise((resolve) => setTimeout(resolve, 20));
+  const pause = () => new Promise((resolve) => setTimeout(resolve, 5));
   addEventListener("load", async () => {
     await pause();
     for (const figure of figures) {
+      // the points in space take some 3 s without a graphics card, and nothing else moves meanwhile
+      if (figure.element.id === "f-space" && isSoftware()) continue;
       await draw(figure);
       await pause();
     }
-    await window.drawAll();
+    window.reportDrawn = true;
+    root.dataset.drawn = "true";
   });
 
   let resizing = 0;

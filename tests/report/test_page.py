@@ -197,7 +197,7 @@ def test_terms_of_the_glossary_are_the_words_of_the_page(full: str) -> None:
 def test_what_is_not_determined_and_what_sigmas_are_of_is_said(full: str) -> None:
     seen = Seen(full)
     assert seen.sections["positions"].count("not determined") == 2  # offset in common up, and its sigma
-    assert "Absolute accuracy" in seen.sections["positions-map"] and "sigma absolute east" in seen.sections["photos"]
+    assert "Absolute accuracy" in seen.sections["positions-map"] and "absolute sigma east" in seen.sections["photos"]
     assert "let go" in seen.sections["photos"] and "left out" in seen.sections["photos"]
     assert "assumed beforehand" in seen.sections["statistics"] and "gcp_list.txt" in seen.sections["processing"]
     for heading in ("redundancy number east", "internal reliability up", "external reliability north"):

@@ -62,8 +62,9 @@ def _ground(material: Material, overlap: Mapping[str, Any]) -> list[tuple[str, s
 def _sigmas(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     if "none" in found:
         return []
+    is_absolute = found["scope"] == "absolute"
     rows = [
-        (f"Sigma of a {what} {found['scope']}, median", _along(found[key]))
+        (f"Absolute sigma of a {what}" if is_absolute else f"Sigma of a {what} {found['scope']}", _along(found[key]))
         for what, key in (("camera", "camera_m"), ("point", "point_m"))
     ]
     absolute = "not known" if found["absolute_m"] is None else _along(found["absolute_m"])
@@ -71,7 +72,8 @@ def _sigmas(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _along(values: Sequence[float]) -> str:
-    known = [(f"{value:.3f}", axis) for value, axis in zip(values, _AXES, strict=True) if np.isfinite(value)]
+    digits = 3 if np.nanmin(np.append(values, np.inf)) < 1 else 1  # of metres, which one position may be off
+    known = [(f"{value:.{digits}f}", axis) for value, axis in zip(values, _AXES, strict=True) if np.isfinite(value)]
     return (
         f"{', '.join(value for value, _ in known)} m {', '.join(axis for _, axis in known)}" if known else "not known"
     )

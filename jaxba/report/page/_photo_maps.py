@@ -233,7 +233,7 @@ def _ellipses(
     area: Map, report: dict[str, Any], photos: list[dict[str, Any]]
 ) -> tuple[list[dict[str, Any]], list[tuple[dict[str, Any], dict[str, Any]]], str]:
     """Return the ellipses, the bar that tells their scale, and what the caption says of them."""
-    project, scope = report["project"], report["sigmas"].get("scope", "")
+    project = report["project"]
     unit_m = unit_metres(project["unit"])
     if not photos:
         return [], [], "No sigmas of positions were computed, so there are no error ellipses."
@@ -257,8 +257,8 @@ def _ellipses(
         "fillcolor": "rgba(86,180,233,0.22)", "line": {"color": SKY, "width": 1.2}, **line_of(outlines),
     }  # fmt: skip
     text = (
-        f"An error ellipse shows how well a position is known horizontally, one sigma {scope} in each direction, and "
-        f"is drawn {enlarged(times)}; the colour is the sigma in height. {report['sigmas'].get('text', '')}".rstrip()
+        "An error ellipse shows how well a position is known horizontally, one sigma in each direction, and is "
+        f"drawn {enlarged(times)}; the colour is the sigma in height. {report['sigmas'].get('text', '')}".rstrip()
     )
     return [trace], [reference(area, times / unit_m)], text
 

@@ -16,7 +16,7 @@ def photo_table(report: dict[str, Any]) -> Table:
     columns = [
         text("photo"), text("state"), Column(name="camera"),
         Column(name="x", unit=unit), Column(name="y", unit=unit), Column(name="z", unit=height_unit),
-        *along(f"sigma {report['sigmas'].get('scope', '')}".rstrip()), text("GNSS position"),
+        *along(sigma_of(report["sigmas"])), text("GNSS position"),
         *along("adjusted - GNSS"),
         *(Column(name=name, unit="°") for name in ("omega", "phi", "kappa")),
         Column(name="keypoints"), Column(name="tie points"), Column(name="partners"),
@@ -39,6 +39,12 @@ def photo_table(report: dict[str, Any]) -> Table:
         "the photos that this one is matched with. A GNSS position that contradicts the block was let go of; one that "
         "was left out took no part.".lstrip(),
     )  # fmt: skip
+
+
+def sigma_of(found: dict[str, Any]) -> str:
+    """Return the heading of a sigma, which says what it is of."""
+    scope = found.get("scope", "")
+    return "absolute sigma" if scope == "absolute" else f"sigma {scope}".rstrip()
 
 
 def camera_table(number_in_table: int, camera: dict[str, Any]) -> Table:

@@ -3,13 +3,14 @@
 from typing import Any
 
 from jaxba.report.page._drawing import short_unit
+from jaxba.report.page._photo_tables import sigma_of
 from jaxba.report.page._tables import AXIS_NAMES, Column, Table, along, number, state, table, text
 
 
 def sigma_blocks(found: dict[str, Any]) -> list[Table | str]:
     """Return what the sigmas of cameras and points are of, their medians, and the absolute accuracy."""
     rows = [
-        [f"sigma of a {what} {found['scope']}, median", *found[key]]
+        [f"{sigma_of(found)} of a {what}, median", *found[key]]
         for what, key in (("camera", "camera_m"), ("point", "point_m"))
     ]
     rows.append(["absolute accuracy of a point", *(found["absolute_m"] or ["not known"] * 3)])

@@ -83,7 +83,8 @@ def _map(figure: "Figure", facts: Facts) -> None:
     axes.scatter(*places[adjusted].T, s=16, color=_BLUE, label="adjusted", zorder=3)
     axes.scatter(*places[~adjusted].T, s=40, color=INK, marker="x", label="not adjusted, where it was measured")
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
-    said = f"ellipses of one sigma, {times:g} times as large" if sizes else "no sigmas are known"
+    scope = facts["sigmas"].get("scope", "")
+    said = f"ellipses of one sigma, {scope}, {times:g} times as large" if sizes else "no sigmas are known"
     titles(figure, "Cameras", f"{int(adjusted.sum())} of {len(photos)} photos adjusted; {said}")
 
 

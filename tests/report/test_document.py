@@ -250,6 +250,8 @@ def test_check_points_are_judged_by_the_target_and_the_worst_is_named(adjusted: 
         assert found["state"] == state and f"target accuracy of {target:g} m up" in found["limits"]
         assert "Worst is b: east +0.000, north +0.010, up -0.050 m." in found["text"]
     assert "0.033 m up" in found["text"]
+    flat = check_light(with_points(adjusted, [[0.03, 0.04, np.nan]], 0.01, is_check=True))
+    assert flat["value"] == "0.050 m across" and "up" not in flat["text"]
 
 
 def test_redundancies_sum_up_and_each_kind_says_what_weighed_it(facts: dict[str, Any], adjusted: Any) -> None:

@@ -23,7 +23,7 @@ def sigmas(material: Material) -> dict[str, Any]:
         return {"none": NOT_ADJUSTED}
     cameras, points = (_median(std_m) for std_m in (adjusted.position_std_m, adjusted.point_std_m))
     if not np.isfinite([cameras, points]).any():
-        return {"none": "Sigmas of points and cameras were not computed."}
+        return {"none": "There are no sigmas of points and cameras: too little holds the block, as the findings tell."}
     scope, text = _scope(material)
     absolute_m, told = _absolute(material, scope, points)
     return {

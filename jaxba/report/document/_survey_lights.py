@@ -123,7 +123,7 @@ class _Off:
             np.where(has, np.sqrt(np.sum(np.where(known, of, 0.0) ** 2, axis=0) / number), np.nan)
             for of in (residual_m, survey_std_m)
         )
-        return _Off(np.where(known, residual_m, np.nan), rms, np.fmax(survey, _PIXELS * gsd))
+        return _Off(np.where(known, residual_m, np.nan), rms, np.where(has, np.fmax(survey, _PIXELS * gsd), np.nan))
 
     @property
     def over_limit(self) -> float:

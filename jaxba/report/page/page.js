@@ -75,7 +75,7 @@
     const legend = entries.length < 2 ? 0 : 12 + 20 * Math.ceil(length / (figure.width - beside));
     if (made.scene) {
       made.height = isPrinting ? 380 : Math.min(height, Math.round(figure.width * 0.9));
-      if (isNarrow || isPrinting) for (const axis of "xyz") made.scene.camera.eye[axis] *= 1.2;
+      if (isNarrow || isPrinting) for (const axis of "xyz") made.scene.camera.eye[axis] *= isPrinting ? 1.35 : 1.2;
     } else if (height) {
       made.height = Math.round(height * (isPrinting ? 0.85 : 1)) + (isNarrow ? legend : 0);
     } else {

@@ -7,7 +7,8 @@ from typing import Any
 from jaxba.report.page._cloud_views import in_space, preview
 from jaxba.report.page._drawing import Figure
 from jaxba.report.page._error_charts import correlation, histogram, radial_profile, sensor_field
-from jaxba.report.page._photo_maps import match_graph, overlap_map, residual_map, sigma_map
+from jaxba.report.page._match_graph import match_graph
+from jaxba.report.page._photo_maps import overlap_map, residual_map, sigma_map
 from jaxba.report.page._photo_tables import camera_table, left_out_table, photo_table
 from jaxba.report.page._processing_tables import hash_table, parameter_table, stage_table, version_table
 from jaxba.report.page._survey_charts import control_chart, control_map, positions_chart

@@ -200,20 +200,29 @@ def read_lists(given: Given) -> dict[str, Any]:
 
     Raises `JaxbaError` where a list cannot be read, and where two files among the photos are called like one.
     """
-    paths = {name: getattr(given, name) for name in _LISTS}
-    for name, usual in FOUND_LISTS.items():
-        if paths[name] is None:
-            paths[name] = _among(given.photos, usual)
+    paths = list_paths(given)
     folder = given.photos.resolve()
-    used = [path.resolve() for path in paths.values() if path is not None and path != _NO_LIST]
+    used = [path.resolve() for path in paths.values() if path is not None]
     return {
         "geotags": _read_list(paths["geotags"], "a geo.txt or CSV"),
         "gcp": _read_list(paths["gcp"], "a gcp_list.txt or CSV"),
         "check": _read_list(paths["check"], "a gcp_list.txt or CSV"),
         "bars": _read_list(paths["bars"], "a CSV of scale bars"),
-        "found_lists": tuple(name for name, path in paths.items() if path is not None and getattr(given, name) is None),
+        "found_lists": tuple(name for name, path in paths.items() if path and getattr(given, name) is None),
         "own_lists": tuple(path.relative_to(folder).as_posix() for path in used if path.is_relative_to(folder)),
     }
+
+
+def list_paths(given: Given) -> dict[str, Path | None]:
+    """Return the file of each kind of list, given or found among the photos; None where there is none.
+
+    Raises `JaxbaError` where two files among the photos are called like one.
+    """
+    paths = {name: getattr(given, name) for name in _LISTS}
+    for name, usual in FOUND_LISTS.items():
+        if paths[name] is None:
+            paths[name] = _among(given.photos, usual)
+    return {name: None if path == _NO_LIST else path for name, path in paths.items()}
 
 
 def _among(photos: Path, usual: str) -> Path | None:
@@ -228,7 +237,7 @@ def _among(photos: Path, usual: str) -> Path | None:
 
 def _read_list(path: Path | None, kind: str) -> tuple[str, str] | None:
     """Return name and text of a list; None where none is given. `kind`: what it is to be, for messages."""
-    if path is None or path == _NO_LIST:
+    if path is None:
         return None
     if not path.is_file():
         raise JaxbaError(f"{path}: there is no such file; give {kind}.")

@@ -29,7 +29,8 @@ class Surveyed:
     """Points on WGS 84, one row a point.
 
     - `height_m`: metres above `height_datum`, see `LocalFrame`; NaN where none was measured.
-    - `declared`: who says what heights are above. `crs`: of the first point, named by code where it has one.
+    - `declared`: who says what heights are above. `is_datum_assumed`: nobody does. `crs`: of the first point, named by
+      code where it has one.
     - `notes`: what was found and decided.
     """
 
@@ -38,6 +39,7 @@ class Surveyed:
     height_m: Float[np.ndarray, " points"]
     height_datum: str
     declared: str
+    is_datum_assumed: bool
     crs: str
     notes: tuple[str, ...]
 
@@ -82,9 +84,11 @@ def surveyed_points(
     if len(stated) > 1:
         both = " and ".join(f"{_above(datum)} ({text})" for datum, text in stated.items())
         raise JaxbaError(f"{name}: heights are above several surfaces, {both}; give all of them above one.")
-    datum, declared = _datum(stated, height_datum, photos_datum, bool(np.isfinite(height).any()), name, notes)
+    has_heights = bool(np.isfinite(height).any())
+    datum, declared = _datum(stated, height_datum, photos_datum, has_heights, name, notes)
     return Surveyed(
         longitude_deg=lon, latitude_deg=lat, height_m=height, height_datum=datum, declared=declared,
+        is_datum_assumed=has_heights and height_datum == AS_PHOTOS and not stated,
         crs=(authority_code(parse_crs(crs[0])) or crs[0]) if len(crs) else "", notes=tuple(notes),
     )  # fmt: skip
 

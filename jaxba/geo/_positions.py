@@ -29,7 +29,7 @@ class Measured:
     - `stated_std_h_m`: as the photo or list states it. `std_m`: sigma east, north, up to weigh the position with.
     - `is_vouched`: the receiver stands behind its height: an RTK or differential fix, or a stated sigma up to 1 m.
     - `time_s`: of exposure; the photo's place in the order where a photo has none. `has_time`: all photos have one.
-    - `height_datum`, `declared`: what heights are above, and who says so.
+    - `height_datum`, `declared`: what heights are above, and who says so. `is_datum_assumed`: some do not say it.
     - `notes`: what was found and decided.
     """
 
@@ -45,6 +45,7 @@ class Measured:
     has_time: bool
     height_datum: str
     declared: str
+    is_datum_assumed: bool
     notes: tuple[str, ...]
 
 
@@ -87,6 +88,7 @@ def measured_positions(
         has_time=has_time,
         height_datum=datum,
         declared=declared,
+        is_datum_assumed=height_datum == "as_tagged" and _say_no_datum(photos),
         notes=(*notes, *found),
     )
 
@@ -174,6 +176,12 @@ def _height_datum(photos: Sequence[Photo], asked: str) -> tuple[str, str, list[s
         return "unknown", "by the photos' tags", []
     mixed = [f"Some heights do not say what they are above; all are taken as {kinds[0]}: {counts}."]
     return kinds[0], "by the photos' tags", mixed if "unknown" in tagged else []
+
+
+def _say_no_datum(photos: Sequence[Photo]) -> bool:
+    """Return whether some heights of the photos do not say what they are above."""
+    positions = [photo.position for photo in photos if photo.position is not None]
+    return any(_tagged_datum(position) == "unknown" for position in positions if position.z_m is not None)
 
 
 def _tagged_datum(position: Position) -> str:

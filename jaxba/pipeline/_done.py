@@ -70,7 +70,7 @@ class Done:
         frame = dataclasses.replace(
             frame, crs="", epsg=None, crs_name="", unit="", height_note="", height_datum="", height_unit=""
         )
-        return dataclasses.replace(reference, frame=frame, review=(), notes=())
+        return dataclasses.replace(reference, frame=frame, review=(), notes=(), assumed_datum=None)
 
     @property
     def routing(self) -> Routing:

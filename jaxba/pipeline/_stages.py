@@ -201,9 +201,10 @@ def _start(done: Done) -> start.Inputs:
 def _adjust(done: Done) -> adjust.Inputs:
     tiles, block = done.settings["tiles"], made(done.start).block
     assert isinstance(tiles, Tiles)
+    assumed_datum = made(done.control).reference.assumed_datum
     return adjust.Inputs(
         photos=done.photos,
-        reference=done.placed,
+        reference=dataclasses.replace(done.placed, assumed_datum=assumed_datum),
         view_graph=made(done.match).view_graph,
         tracks=made(done.tracks).tracks,
         block=block,

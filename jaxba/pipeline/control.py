@@ -27,7 +27,7 @@ from jaxba.pipeline._control_lists import heights_of_points, points_of_lists
 from jaxba.pipeline._mark_turn import expected_px
 from jaxba.pipeline._marks import marks_in_photos
 from jaxba.report import Told, bar_facts, control_facts, control_lines, reference_facts
-from jaxba.scene import Control, LeftOut, LocalFrame, Photo, Reference, ScaleBars
+from jaxba.scene import AssumedDatum, Control, LeftOut, LocalFrame, Photo, Reference, ScaleBars
 
 _ASSUMED_MARK_STD_PX = 1.0
 _LEAST_FIT = {"helmert": 3, "affine": 4}  # control points that are marked twice
@@ -213,6 +213,10 @@ def _surveyed(inputs: Inputs, params: Params, points: Sequence[SurveyedPoint], n
     height_m, told = geo.heights_above(frame.height_datum, surveyed, names)
     notes += told
     known = np.isfinite(height_m)
+    if surveyed.is_datum_assumed and params.method != "none":
+        of = () if reference.assumed_datum is None else reference.assumed_datum.of
+        assumed = AssumedDatum((*of, names), frame.height_datum)
+        reference = dataclasses.replace(reference, assumed_datum=assumed)
     std_h, std_v = (
         np.array([getattr(point, f"std_{axis}_m") or getattr(params, f"std_{axis}") for point in points])
         for axis in ("h", "v")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxba._errors import JaxbaError
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.report import Told, grouped, reference_facts, with_ranges
-from jaxba.scene import LeftOut, Photo, Reference
+from jaxba.scene import AssumedDatum, LeftOut, Photo, Reference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,6 +136,9 @@ def run(inputs: Inputs, params: Params) -> Outputs:
         ),
         flight=flight,
         flight_std_m=params.flight_offset,
+        assumed_datum=AssumedDatum(("photos",), measured.height_datum)
+        if measured.is_datum_assumed and has_height.any()
+        else None,
     )
     return Outputs(reference=reference, target_crs=params.target_crs)
 

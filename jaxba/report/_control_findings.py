@@ -118,13 +118,14 @@ def _gnss_off(
 ) -> str:
     how = "compared only" if is_compared else "the block follows control"
     known = [std if math.isfinite(offset) else math.inf for offset, std in zip(offset_m, std_m, strict=True)]
+    residual_m = [-offset for offset in offset_m]
     sigma = f" (sigma {along_axes(offset_std_m, '.2g')})" if any(map(math.isfinite, offset_std_m)) else ""
     named = f" Heights of the list read {looks_like} would make just this difference." if looks_like else ""
     return (
-        f"GNSS positions minus the block as control places it: {along_axes(offset_m, '+.2f')}{sigma}, for all photos "
-        f"in common, where one position has sigmas of {along_axes(known, '.2g')}; {how}. Centimetres and decimetres "
-        "are the antenna's offset or a base beside its mark; metres and tens of metres two datums or height systems; "
-        f"hundreds a wrong zone or swapped axes of one of the two.{named}"
+        f"The block as control places it lies off its GNSS positions, all alike (adjusted minus measured): "
+        f"{along_axes(residual_m, '+.2f')}{sigma}, where one position has sigmas of {along_axes(known, '.2g')}; {how}. "
+        "Centimetres and decimetres are the antenna's offset or a base beside its mark; metres and tens of metres two "
+        f"datums or height systems; hundreds a wrong zone or swapped axes of one of the two.{named}"
     )
 
 

@@ -16,6 +16,8 @@ from jaxba.scene import Finding
 _MOST_NAMES = 10
 _MOST_ROWS = 8
 _TO_KNOW = ("edges left out", "common offset", "scale by bars")
+_DATUMS = {"ellipsoidal": "the WGS 84 ellipsoid", "mean_sea_level": "mean sea level (no geoid named)"}
+_TURNS = {1: "a quarter turn", 2: "half a turn", 3: "a quarter turn"}
 _LOOKS = {
     "down from one height": " (all photos look straight down from one height)",
     "down": " (photos look straight down)",
@@ -195,11 +197,49 @@ def _weak_positions(names: Sequence[str], std_m: Sequence[float], median_m: floa
     )
 
 
-def _common_offset(median_m: float, receiver_std_m: float) -> str:
+def _common_offset(median_m: float, axes: Sequence[str], receiver_std_m: Sequence[float]) -> str:
+    of_receiver = ", ".join(f"{axis} {std:.1f}" for axis, std in zip(axes, receiver_std_m, strict=True))
     return (
-        f"Position sigmas (median {median_m:.2g} m) are about the mean of all GNSS positions. Those of a single "
-        f"receiver have an offset in common, up to their own sigma of {receiver_std_m:.1f} m horizontally, which "
-        "is not in these: only control or a differential receiver removes it."
+        f"Position sigmas (median {median_m:.2g} m) are those within the block, about the mean of all GNSS positions. "
+        f"Positions of a single receiver have an offset in common, up to their own sigma ({of_receiver} m), "
+        "which is not in these: only control or a differential receiver removes it."
+    )
+
+
+def _height_datum_assumed(of: Sequence[str], datum: str) -> str:
+    whose = " and ".join("the photos" if name == "photos" else name for name in of)
+    what = "above an unknown surface" if datum == "unknown" else f"taken to be above {_DATUMS.get(datum, datum)}"
+    return (
+        f"Heights of {whose} do not say what they are above: they are {what}, and so are the heights of all results. "
+        "Ellipsoid and mean sea level lie up to 100 m apart. Declare it, by crs.height_datum for photos and "
+        "control.height_datum for surveyed points."
+    )
+
+
+def _attitudes_contradict(names: Sequence[str], turn_deg: Sequence[float], measured: int, quarter_turns: int) -> str:
+    figures = [f"{angle:.0f} degrees" for angle in turn_deg]
+    verb = "contradicts" if len(names) == 1 else "contradict"
+    if quarter_turns and len(names) < measured:
+        cause = (
+            f"These are {_TURNS[quarter_turns]} about the viewing direction, and the other photos are not turned: "
+            "such pictures were turned after the flight, as image viewers do, which leave the gimbal's tags as they "
+            "were. Give these photos as the camera wrote them."
+        )
+    elif quarter_turns:
+        cause = (
+            f"All photos have {_TURNS[quarter_turns]} about the viewing direction: the camera is mounted turned by "
+            "it, or its yaw is counted from another side. Give attitudes in the list of positions that say how the "
+            "pictures lie."
+        )
+    else:
+        cause = (
+            "They may be of the aircraft rather than of the camera, or in another convention of yaw, pitch and roll. "
+            "Look at the tags, or give attitudes in the list of positions."
+        )
+    return (
+        f"{many(len(names), 'attitude')} of {measured:,} {verb} the block by more than a gimbal or a compass errs, and "
+        f"hardly {'counts' if len(names) == 1 else 'count'} in it: {_named(names, figures)}. {cause} Attitudes also "
+        "choose pairs and start values."
     )
 
 
@@ -229,6 +269,8 @@ WORDS: dict[str, Callable[..., str]] = {
     "principal point off": _principal_point_off,
     "weak positions": _weak_positions,
     "common offset": _common_offset,
+    "height datum assumed": _height_datum_assumed,
+    "attitudes contradict": _attitudes_contradict,
     **BAR_WORDS,
     **CONTROL_WORDS,
 }

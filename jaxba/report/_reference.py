@@ -22,7 +22,10 @@ def reference_facts(reference: Reference) -> dict[str, Any]:
 
 
 def flight_facts(flights: FlightOffsets | None) -> list[dict[str, Any]]:
-    """Return what the positions of each flight are off in common, with its sigma; nothing where that was not asked."""
+    """Return what each flight's positions have in common, adjusted minus measured, with its sigma.
+
+    Nothing where flights are not told apart.
+    """
     if flights is None:
         return []
     columns = flights.number, flights.num_photos, flights.offset_m, flights.std_m
@@ -30,7 +33,7 @@ def flight_facts(flights: FlightOffsets | None) -> list[dict[str, Any]]:
         {
             "flight": int(number) + 1,
             "photos": int(count),
-            "offset_m": [float(value) if np.isfinite(value) else None for value in offset],
+            "offset_m": [0.0 - float(value) if np.isfinite(value) else None for value in offset],
             "std_m": [float(value) if np.isfinite(value) else None for value in std],
         }
         for number, count, offset, std in zip(*columns, strict=True)
@@ -46,5 +49,7 @@ def flight_lines(facts: Sequence[Mapping[str, Any]]) -> list[str]:
         ]
         values = ", ".join(f"{value:+.3f}" + ("" if std is None else f" ({std:.3f})") for _, value, std in axes)
         names = ", ".join(axis for axis, _, _ in axes)
-        lines.append(f"{fact['flight']}, {fact['photos']} photos: positions off by {values} m {names}")
+        lines.append(
+            f"{fact['flight']}, {fact['photos']} photos: adjusted minus measured positions in common {values} m {names}"
+        )
     return lines

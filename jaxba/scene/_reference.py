@@ -32,6 +32,17 @@ class LocalFrame:
     height_unit: str = "metre"
 
 
+@dataclass(frozen=True)
+class AssumedDatum:
+    """What heights were taken to be above that do not say it: `LocalFrame.height_datum`, and whose they are.
+
+    - `of`: `photos`, and the name of a list of points.
+    """
+
+    of: tuple[str, ...]
+    datum: str
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reference:
     """Measured positions and attitudes in the local frame, one row an image; NaN where there is none.
@@ -45,6 +56,7 @@ class Reference:
     - `flight`: of each image, from 0, and `flight_std_m`: sigma of what the positions of a flight have in common and no
       others; None where flights are not told apart.
     - `review`: images whose position is not used, or used with a large sigma of its own, with the reason.
+    - `assumed_datum`: of heights that do not say what they are above; None where all do.
     - `notes`: what was found and decided, in sentences.
     """
 
@@ -59,6 +71,7 @@ class Reference:
     notes: tuple[str, ...] = ()
     flight: Int[np.ndarray, " images"] | None = None
     flight_std_m: float | None = None
+    assumed_datum: AssumedDatum | None = None
 
 
 @dataclass(frozen=True, eq=False)

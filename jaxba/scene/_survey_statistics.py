@@ -13,7 +13,8 @@ class MeasuredKind:
     - `name`: tie points, marks, position horizontal, ... `unit`: of sigmas: px, m or deg.
     - `count`, `redundancy`: measured components, and their redundancy numbers summed.
     - `std`: that the residuals show, and `std_share`, its own sigma over it. `taken_std`: that it
-      was taken to have, from tags, lists or parameters; NaN where nothing says one.
+      was taken to have, from tags, lists or parameters; NaN where nothing says one. `weighed_std`: with which the
+      adjustment weighed it, in the median.
     - `is_known`: whether there is enough redundancy to rely on `std`.
     """
 
@@ -25,13 +26,16 @@ class MeasuredKind:
     std_share: float
     taken_std: float
     is_known: bool
+    weighed_std: float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurveyStatistics:
     """Statistics of an adjusted block.
 
-    - `redundancy`: of all measurements together. `kinds`: of them.
+    - `redundancy`: of measurements and assumptions together. `kinds`: of measurements.
+    - `assumed_count`, `assumed_redundancy`: components of what is assumed beside them, and their redundancy numbers
+      summed: weak priors on intrinsics, and offsets of positions that are near zero.
     - `unknowns`: names of what images share: intrinsics, offsets of positions. `unknown_std`: sigmas, in their units.
     - `correlation`: among these; NaN of what is fixed.
     """
@@ -41,3 +45,5 @@ class SurveyStatistics:
     unknowns: tuple[str, ...]
     unknown_std: Float[np.ndarray, " unknowns"]
     correlation: Float[np.ndarray, "unknowns unknowns"]
+    assumed_count: int = 0
+    assumed_redundancy: float = 0.0

@@ -11,6 +11,7 @@ from scipy.special import gammaincinv
 from jaxba.geometry import CAMERAS
 from jaxba.scene import Block, Finding, Photo, Reference, described
 from jaxba.sfm._adjust import Adjusted
+from jaxba.sfm._attitude_findings import attitude_findings
 from jaxba.sfm._intrinsics import intrinsics_at_bounds, natural_intrinsics
 from jaxba.sfm._measured import BY_CHANCE, OUTLIER, PLAIN_M, robust_limit, used_positions
 from jaxba.sfm._uncertainty import Uncertainty
@@ -100,6 +101,8 @@ def findings(
         ("Scatter of positions", lambda: _scatter(adjusted, reference, fit)),
         ("Drift of heights", lambda: _height_drift(block, reference)),
         ("Use of heights", lambda: _no_heights(block, reference)),
+        ("Datum of heights", lambda: _assumed_datum(block, reference)),
+        ("Attitudes", lambda: attitude_findings(block, reference, photos)),
         ("Focal length against height", lambda: _focal_and_height(block, sigmas, reference, is_controlled)),
         ("Intrinsics", lambda: _intrinsics(block, start, photos)),
         ("Sigmas of positions", lambda: _positions(block, sigmas, reference, photos, is_controlled)),
@@ -226,6 +229,13 @@ def _no_heights(block: Block, reference: Reference) -> list[Finding]:
     return [Finding.of("no heights")]
 
 
+def _assumed_datum(block: Block, reference: Reference) -> list[Finding]:
+    assumed = reference.assumed_datum
+    if assumed is None or not block.is_georeferenced:
+        return []
+    return [Finding.of("height datum assumed", of=list(assumed.of), datum=assumed.datum)]
+
+
 def _focal_and_height(block: Block, sigmas: Uncertainty, reference: Reference, is_controlled: bool) -> list[Finding]:
     """The focal length and the height above ground of a flat nadir block trade off: df / f = dh / h.
 
@@ -310,8 +320,11 @@ def _positions(
     used = used_positions(block, reference)
     if used.any() and not is_controlled:
         stated = np.median(reference.std_m[block.image_index[used]], axis=0)
-        if np.isfinite(stated[0]) and stated[0] > 1:
-            found.append(Finding.of("common offset", median_m=middle, receiver_std_m=float(stated[0])))
+        plain = np.isfinite(stated) & (stated > PLAIN_M)
+        if plain.any():
+            axes = [axis for axis, much in zip(("east", "north", "up"), plain, strict=True) if much]
+            figures = {"axes": axes, "receiver_std_m": stated[plain].tolist()}
+            found.append(Finding.of("common offset", median_m=middle, **figures))
     return found
 
 

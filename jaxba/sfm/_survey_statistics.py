@@ -15,7 +15,8 @@ def survey_statistics(
 ) -> SurveyStatistics:
     """Return them; `found`: of the problem as its errors show it."""
     taken = _taken(adjusted, reference, control)
-    kinds = tuple(_kind(one, taken[one.name]) for one in found.components if one.name in taken)
+    kinds = tuple(_kind(one, taken[one.name], adjusted) for one in found.components if one.name in taken)
+    assumed = [one for one in found.components if one.name not in taken]
     covariance = found.covariance
     single = adjusted.block.camera_parameters.shape[0] == 1
     return SurveyStatistics(
@@ -24,11 +25,14 @@ def survey_statistics(
         unknowns=tuple(n.removeprefix("camera 0 ") if single else n for n in covariance.border_names),
         unknown_std=np.sqrt(np.maximum(np.diagonal(covariance.border), 0.0)),
         correlation=covariance.correlation,
+        assumed_count=sum(one.count for one in assumed),
+        assumed_redundancy=float(sum(one.redundancy for one in assumed)),
     )
 
 
-def _kind(one: VarianceComponent, taken_std: float) -> MeasuredKind:
+def _kind(one: VarianceComponent, taken_std: float, adjusted: Adjusted) -> MeasuredKind:
     turn = one.group in _DEGREES
+    weighed_std = adjusted.std_px if one.name == "tie points" else _weighed(one, adjusted)
     return MeasuredKind(
         name=one.name,
         unit="px" if one.group == "observations" else "deg" if turn else "m",
@@ -38,7 +42,17 @@ def _kind(one: VarianceComponent, taken_std: float) -> MeasuredKind:
         std_share=one.factor_std / (2 * one.factor) if one.factor > 0 else float("nan"),
         taken_std=taken_std,
         is_known=one.is_known,
+        weighed_std=float(np.degrees(weighed_std)) if turn else weighed_std,
     )
+
+
+def _weighed(one: VarianceComponent, adjusted: Adjusted) -> float:
+    """Return the median sigma of a kind in the last solve; the statistics are of sigmas that its errors show."""
+    prior = adjusted.problem.prior(one.group)
+    if prior is None or one.group != "position":
+        return one.stated_std
+    std_m = np.asarray(vars(prior)["std_m"])[:, one.axes]
+    return float(np.median(std_m[np.isfinite(std_m)]))
 
 
 def _taken(adjusted: Adjusted, reference: Reference, control: Control) -> dict[str, float]:

@@ -28,8 +28,10 @@ def test_a_proj_string_is_named_by_the_code_of_its_zone():
 def test_heights_are_taken_for_the_photos_and_this_is_said():
     found = surveyed("EPSG:32615", photos_datum="ellipsoidal")
     assert found.height_datum == "ellipsoidal" and "for the same as the photos'" in found.notes[-1]
+    assert found.is_datum_assumed
     declared = surveyed("EPSG:32615", photos_datum="ellipsoidal", height_datum="EPSG:5773")
-    assert declared.height_datum == "EPSG:5773" and not declared.notes
+    assert declared.height_datum == "EPSG:5773" and not declared.notes and not declared.is_datum_assumed
+    assert not surveyed("EPSG:32615+5773").is_datum_assumed
 
 
 def test_feet_of_a_crs_are_feet_in_height_too():

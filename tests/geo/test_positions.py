@@ -90,7 +90,9 @@ def test_heights_that_do_not_say_are_taken_with_those_that_do_and_it_is_said():
     measured = measured_positions(photos)
     assert measured.height_datum == "ellipsoidal"
     assert "Some heights do not say what they are above; all are taken as ellipsoidal" in measured.notes[0]
-    assert measured_positions(photos[1:]).height_datum == "unknown"
+    assert measured_positions(photos).is_datum_assumed and not measured_positions(photos[:1]).is_datum_assumed
+    assert measured_positions(photos[1:]).height_datum == "unknown" and measured_positions(photos[1:]).is_datum_assumed
+    assert not measured_positions(photos[1:], height_datum="ellipsoidal").is_datum_assumed
 
 
 def test_a_compound_crs_of_positions_declares_their_vertical_datum():

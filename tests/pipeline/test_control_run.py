@@ -134,9 +134,21 @@ def test_the_report_tells_of_control_what_the_files_and_the_summary_do(run: Run,
     assert up["product_m"] == pytest.approx(np.hypot(found["check_rms_m"][2], 0.03)) and up["num"] == 5
     lights = {light["name"]: light for light in facts["quality"]}
     assert lights["Control points"]["state"] == lights["Check points"]["state"] == "good"
-    variance = np.array([np.add(np.square(p["std_m"]), np.square(p["survey_std_m"])) for p in found["points"]])[5:]
-    assert lights["Check points"]["value"] == f"{np.sqrt(np.mean(of_checks**2 / variance)):.2f} sigma"
-    assert facts["positions"]["common_m"] == run.facts["control"]["gnss_minus_control_m"]
+    east, north, up_m = found["check_rms_m"]
+    assert lights["Check points"]["value"] == f"{np.hypot(east, north):.3f} m across, {up_m:.3f} m up"
+    worst = int(np.argmax(np.linalg.norm(of_checks, axis=1)))
+    assert f"Worst is {found['points'][5 + worst]['name']}:" in lights["Check points"]["text"]
+    assert facts["sigmas"]["scope"] == "absolute"
+    assert facts["sigmas"]["absolute_m"] == pytest.approx(np.hypot(found["check_rms_m"], [0.02, 0.02, 0.03]))
+    told = zip(facts["positions"]["common_m"] or [None] * 3, run.facts["control"]["gnss_minus_control_m"], strict=True)
+    assert all(common is None or common == -offset for common, offset in told)
+    assert any("gcp_list.txt and check_list.txt do not say what they are above" in text for text in facts["findings"])
+    # redundancy numbers of the points, by the sizes of errors that show, are those of the adjustment's rows
+    kinds = {kind["name"]: kind["redundancy"] for kind in facts["statistics"]["kinds"]}
+    numbers = np.array([point["redundancy"] for point in found["points"] if point["role"] == "control"])
+    assert numbers[:, :2].sum() == pytest.approx(kinds["control horizontal"], rel=0.02)
+    assert numbers[:, 2].sum() == pytest.approx(kinds["control vertical"], rel=0.02)
+    assert sum(kinds.values()) == pytest.approx(facts["statistics"]["redundancy"], abs=1e-3)
 
 
 def test_a_list_that_is_not_there_is_named(survey: Survey, tmp_path: Path) -> None:

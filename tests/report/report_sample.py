@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxba.report.document._glossary import GLOSSARY
+
 EAST, NORTH, GROUND, HEIGHT = 523_400.0, 4_612_800.0, 212.0, 292.0
 FORWARD, ACROSS = 12.0, 22.0  # spacing of photos along and between strips
 UNKNOWN = {"none": "This part was not computed in this run."}
@@ -39,12 +41,17 @@ def sample(num_photos: int = 24, num_points: int = 2000) -> dict[str, Any]:
         ],
         "summary": [
             {"name": "Photos adjusted", "value": f"{adjusted} of {num_photos}"},
-            {"name": "Ground pixel size", "value": "2.1 cm"},
+            {"name": "Ground sample distance", "value": "2.1 cm"},
             {"name": "Area", "value": "1.9 ha"},
             {"name": "Points", "value": f"{4 * num_points:,}"},
             {"name": "Reprojection error, median", "value": "0.61 px"},
             {"name": "Check points, 3D RMSE", "value": "0.031 m"},
         ],
+        "sigmas": {
+            "scope": "absolute", "text": "Sigmas are absolute, in the frame of the control points.",
+            "camera_m": [0.012, 0.013, 0.021], "point_m": [0.014, 0.014, 0.028],
+            "absolute_m": [0.02, 0.02, 0.028], "absolute_text": "RMSE of the check points.",
+        },
         "cloud": _cloud(rng, photos, num_points),
         "photos": photos,
         "pairs": _pairs(rng, photos),
@@ -59,9 +66,7 @@ def sample(num_photos: int = 24, num_points: int = 2000) -> dict[str, Any]:
         ],
         "processing": _processing(rng, photos),
         "glossary": [
-            {"term": "Reprojection error", "text": "Distance in the photo between a measured keypoint and its point."},
-            {"term": "Sigma", "text": "Standard deviation, from the covariance of the adjustment (Förstner, 2016)."},
-            {"term": "RMSE", "text": "Root of the mean of squared differences at check points."},
+            {"term": term, "text": text} for term, text in GLOSSARY.items()
         ],
     }  # fmt: skip
 
@@ -103,7 +108,7 @@ def _photos(rng: np.random.Generator, count: int) -> list[dict[str, Any]]:
             "std_m": None if left else _round(rng.uniform(0.008, 0.02, 3) * [1, 1, 1.7], 4),
             "ellipse_m": None if left else _round([rng.uniform(0.014, 0.02), 0.010, rng.uniform(0, 180)], 4),
             "measured": _round(np.array([x, y, z]) - off), "residual_m": None if left else _round(off),
-            "position": "gated" if gated else "used",
+            "position": "used" if not gated else "let go" if k % 2 else "left out",
             "omega_phi_kappa_deg": None if left else _round([rng.normal(), 0.3, 90 + 180 * (strip % 2)], 2),
             "observations": 0 if left else int(rng.integers(1800, 5200)),
             "keypoints": None if k == count - 1 else int(rng.integers(7000, 10000)),
@@ -132,7 +137,7 @@ def _cloud(rng: np.random.Generator, photos: list[dict[str, Any]], count: int) -
     }  # fmt: skip
 
 
-def _pairs(rng: np.random.Generator, photos: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _pairs(rng: np.random.Generator, photos: list[dict[str, Any]]) -> dict[str, Any]:
     pairs = []
     for i, first in enumerate(photos):
         for j in range(i + 1, min(i + 60, len(photos))):
@@ -150,7 +155,8 @@ def _pairs(rng: np.random.Generator, photos: list[dict[str, Any]]) -> list[dict[
                 "first": i, "second": j, "matches": matches, "putative": putative, "state": state,
                 "median_px": None if state == "rejected" else 0.52, "angle_deg": _round(distance / 1.4, 1),
             })  # fmt: skip
-    return pairs
+    keys = ("first", "second", "matches", "putative", "state", "median_px", "angle_deg")
+    return {key: [pair[key] for pair in pairs] for key in keys}
 
 
 def _overlap(photos: list[dict[str, Any]]) -> dict[str, Any]:
@@ -159,7 +165,11 @@ def _overlap(photos: list[dict[str, Any]]) -> dict[str, Any]:
     columns, rows = np.ceil((high - low) / cell).astype(int)
     x, y = low[0] + cell * (np.arange(columns) + 0.5), low[1] + cell * (np.arange(rows) + 0.5)
     sees = (abs(x - places[:, :1])[:, None, :] <= 20) & (abs(y - places[:, 1:])[:, :, None] <= 14)
-    return {"x0": _round(low[0]), "y0": _round(low[1]), "cell": cell, "rows": sees.sum(axis=0).tolist()}
+    rows = sees.sum(axis=0)
+    return {
+        "x0": _round(low[0]), "y0": _round(low[1]), "cell": cell, "area_m2": float((rows > 1).sum() * cell**2),
+        "median": float(np.median(rows[rows > 0])), "rows": rows.tolist(),
+    }  # fmt: skip
 
 
 def _residuals(rng: np.random.Generator) -> dict[str, Any]:
@@ -200,8 +210,15 @@ def _camera() -> dict[str, Any]:
     keys = ("name", "unit", "start", "value", "std", "fixed")
     return {
         "name": "DJI FC6310 8.8 mm", "model": "Brown-Conrady", "num_photos": 24, "width_px": 4000, "height_px": 3000,
-        "parameters": [dict(zip(keys, row, strict=True)) for row in rows],
+        "focal_from": "the tags and the size of the sensor",
+        "parameters": [dict(zip(keys, row, strict=True)) | _change(row) for row in rows],
     }  # fmt: skip
+
+
+def _change(row: tuple[Any, ...]) -> dict[str, float | None]:
+    _, _, start, value, std, _ = row
+    change = None if start is None else round(value - start, 6)
+    return {"change": change, "change_over_sigma": None if change is None or std is None else change / std}
 
 
 def _calibration(rng: np.random.Generator) -> dict[str, Any]:
@@ -209,11 +226,13 @@ def _calibration(rng: np.random.Generator) -> dict[str, Any]:
     spread = rng.normal(size=(len(names), 10))
     spread[4] = -0.9 * spread[3] + 0.3 * spread[4]
     kinds = [
-        ("tie points", "px", 96_412, 71_233.4, 0.71, 0.004, 0.7, True), ("marks", "px", 64, 51.2, 0.4, 0.1, 0.5, True),
-        ("position horizontal", "m", 42, 21.7, 0.021, 0.15, 0.02, True),
-        ("position up", "m", 21, 9.4, 0.043, 0.23, 0.05, False),
+        ("tie points", "px", 96_412, 71_227.4, 0.71, 0.004, None, 0.66, True),
+        ("marks", "px", 64, 51.2, 0.4, 0.1, 0.5, 0.5, True),
+        ("position horizontal", "m", 42, 21.7, 0.021, 0.15, 0.02, 0.02, True),
+        ("position up", "m", 21, 6.7, 0.043, 0.23, 0.05, 0.05, False),
+        ("assumed beforehand", "", 9, 9.0, None, None, None, None, None),
     ]  # fmt: skip
-    keys = ("name", "unit", "count", "redundancy", "std", "std_share", "taken_std", "is_known")
+    keys = ("name", "unit", "count", "redundancy", "std", "std_share", "taken_std", "weighed_std", "is_known")
     return {
         "correlation": {"names": names, "matrix": _round(np.corrcoef(spread), 3)},
         "statistics": {
@@ -234,20 +253,22 @@ def _survey(rng: np.random.Generator, adjusted: int) -> dict[str, Any]:
             "std_m": [0.008, 0.008, 0.014], "without_std_m": [0.013, 0.013, 0.022],
             "survey_std_m": [0.01, 0.01, 0.015], "mark_rms_px": 0.42,
             "over_sigma": 3.4 if k == 3 else _round(rng.uniform(0.3, 1.9), 2), "set_aside": ["up"] if k == 3 else [],
+            "redundancy": [0.0 if k == 0 else 0.42, 0.42, 0.38],
             "without_m": _round(1.6 * off), "detectable_m": ["any" if k == 0 else 0.06, 0.06, 0.11],
             "reach_m": [0.01, 0.01, None if k == 0 else 0.03], "suspect": k == 3,
         })  # fmt: skip
     bar = dict.fromkeys(("length_m", "adjusted_m"), 1.2) | {"std_m": 0.0005, "adjusted_std_m": 0.0009}
     return {
         "positions": {
-            "num": adjusted, "mean_m": [0.001, -0.002, 0.004], "rms_m": [0.021, 0.019, 0.043],
+            "num": adjusted - 1, "num_let_go": 1, "num_left_out": 1,
+            "mean_m": [0.001, -0.002, 0.004], "rms_m": [0.021, 0.019, 0.043],
             "stated_m": [0.02, 0.02, 0.05], "taken_m": [0.02, 0.02, 0.05],
-            "common_m": [0.012, -0.031, 0.088], "common_std_m": [0.006, 0.006, 0.011],
+            "common_m": [0.012, -0.031, None], "common_std_m": [0.006, 0.006, None],
             "flights": [{"number": 1, "num_photos": adjusted, "offset_m": [0.01, -0.03, 0.09],
                          "std_m": [0.006, 0.006, 0.01]}],
         },
         "attitudes": {"num": adjusted, "names": ["about east", "about north", "about up"], "mean_deg": [0.4, -0.1, 0.2],
-                      "rms_deg": [1.3, 0.4, 0.5]},
+                      "spread_deg": [1.3, 0.4, 0.5], "contradict": []},
         "control": {
             "method": "adjust", "num_control": 5, "num_check": 4,
             "control_rms_m": [0.011, 0.012, 0.02], "check_rms_m": [0.014, 0.013, 0.024],
@@ -273,8 +294,8 @@ def _survey(rng: np.random.Generator, adjusted: int) -> dict[str, Any]:
 
 
 def _processing(rng: np.random.Generator, photos: list[dict[str, Any]]) -> dict[str, Any]:
-    def hashed(name: str) -> dict[str, str]:
-        return {"name": name, "sha256": rng.bytes(32).hex()}
+    def hashed(name: str, **more: str) -> dict[str, str]:
+        return {"name": name, **more, "sha256": rng.bytes(32).hex()}
 
     return {
         "parameters": [
@@ -290,7 +311,8 @@ def _processing(rng: np.random.Generator, photos: list[dict[str, Any]]) -> dict[
             {"name": "export", "seconds": None, "lines": []},
         ],
         "versions": [{"name": "jaxba", "version": "0.1.0"}, {"name": "jax", "version": "0.8.1"}],
-        "inputs": [hashed(photo["name"]) for photo in photos], "outputs": [hashed("cloud.laz"), hashed("cameras.csv")],
+        "inputs": [hashed("gcp_list.txt", what="gcp"), *(hashed(photo["name"], what="photo") for photo in photos)],
+        "outputs": [hashed("cloud.laz"), hashed("cameras.csv")],
     }  # fmt: skip
 
 

@@ -208,10 +208,47 @@ CASES = [
         "m), p3 (0.5 m), p4 (0.5 m), p5 (0.5 m), p6 (0.5 m), p7 (0.5 m), p8 (0.5 m), p9 (0.5 m) and 2 more.",
     ),
     (
-        Finding.of("common offset", median_m=0.02, receiver_std_m=3.0),
-        "Position sigmas (median 0.02 m) are about the mean of all GNSS positions. Those of a single receiver "
-        "have an offset in common, up to their own sigma of 3.0 m horizontally, which is not in these: only "
-        "control or a differential receiver removes it.",
+        Finding.of("common offset", median_m=0.02, axes=["east", "north", "up"], receiver_std_m=[3.0, 3.0, 5.0]),
+        "Position sigmas (median 0.02 m) are those within the block, about the mean of all GNSS positions. Positions "
+        "of a single receiver have an offset in common, up to their own sigma (east 3.0, north 3.0, up 5.0 m), which "
+        "is not in these: only control or a differential receiver removes it.",
+    ),
+    (
+        Finding.of("height datum assumed", of=["photos"], datum="unknown"),
+        "Heights of the photos do not say what they are above: they are above an unknown surface, and so are the "
+        "heights of all results. Ellipsoid and mean sea level lie up to 100 m apart. Declare it, by crs.height_datum "
+        "for photos and control.height_datum for surveyed points.",
+    ),
+    (
+        Finding.of("height datum assumed", of=["photos", "gcp_list.txt"], datum="ellipsoidal"),
+        "Heights of the photos and gcp_list.txt do not say what they are above: they are taken to be above the WGS 84 "
+        "ellipsoid, and so are the heights of all results. Ellipsoid and mean sea level lie up to 100 m apart. "
+        "Declare it, by crs.height_datum for photos and control.height_datum for surveyed points.",
+    ),
+    (
+        Finding.of(
+            "attitudes contradict", names=["a.jpg", "b.jpg"], turn_deg=[178.4, 177.0], measured=18, quarter_turns=2
+        ),
+        "2 attitudes of 18 contradict the block by more than a gimbal or a compass errs, and hardly count in it: a.jpg "
+        "(178 degrees), b.jpg (177 degrees). These are half a turn about the viewing direction, and the other photos "
+        "are not turned: such pictures were turned after the flight, as image viewers do, which leave the gimbal's "
+        "tags as they were. Give these photos as the camera wrote them. Attitudes also choose pairs and start values.",
+    ),
+    (
+        Finding.of(
+            "attitudes contradict", names=["a.jpg", "b.jpg"], turn_deg=[90.0, 91.0], measured=2, quarter_turns=1
+        ),
+        "2 attitudes of 2 contradict the block by more than a gimbal or a compass errs, and hardly count in it: a.jpg "
+        "(90 degrees), b.jpg (91 degrees). All photos have a quarter turn about the viewing direction: the camera is "
+        "mounted turned by it, or its yaw is counted from another side. Give attitudes in the list of positions that "
+        "say how the pictures lie. Attitudes also choose pairs and start values.",
+    ),
+    (
+        Finding.of("attitudes contradict", names=["a.jpg"], turn_deg=[61.0], measured=18, quarter_turns=0),
+        "1 attitude of 18 contradicts the block by more than a gimbal or a compass errs, and hardly counts in it: "
+        "a.jpg (61 degrees). They may be of the aircraft rather than of the camera, or in another convention of yaw, "
+        "pitch and roll. Look at the tags, or give attitudes in the list of positions. Attitudes also choose pairs and "
+        "start values.",
     ),
     (
         Finding.of("control without a place"),
@@ -413,10 +450,10 @@ CASES = [
             is_compared=False,
             looks_like="",
         ),
-        "GNSS positions minus the block as control places it: east +1.50, north -2.00 m (sigma east 0.02, north 0.02 "
-        "m), for all photos in common, where one position has sigmas of east 0.03, north 0.03 m; the block follows "
-        "control. Centimetres and decimetres are the antenna's offset or a base beside its mark; metres and tens of "
-        "metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the two.",
+        "The block as control places it lies off its GNSS positions, all alike (adjusted minus measured): east -1.50, "
+        "north +2.00 m (sigma east 0.02, north 0.02 m), where one position has sigmas of east 0.03, north 0.03 m; the "
+        "block follows control. Centimetres and decimetres are the antenna's offset or a base beside its mark; metres "
+        "and tens of metres two datums or height systems; hundreds a wrong zone or swapped axes of one of the two.",
     ),
     (
         Finding.of(
@@ -427,11 +464,11 @@ CASES = [
             is_compared=True,
             looks_like="feet as metres",
         ),
-        "GNSS positions minus the block as control places it: east +1.50, north -2.00, up +31.00 m, for all photos in "
-        "common, where one position has sigmas of east 3, north 3 m; compared only. Centimetres and decimetres are the "
-        "antenna's offset or a base beside its mark; metres and tens of metres two datums or height systems; hundreds "
-        "a wrong zone or swapped axes of one of the two. Heights of the list read feet as metres would make just this "
-        "difference.",
+        "The block as control places it lies off its GNSS positions, all alike (adjusted minus measured): east -1.50, "
+        "north +2.00, up -31.00 m, where one position has sigmas of east 3, north 3 m; compared only. Centimetres and "
+        "decimetres are the antenna's offset or a base beside its mark; metres and tens of metres two datums or height "
+        "systems; hundreds a wrong zone or swapped axes of one of the two. Heights of the list read feet as metres "
+        "would make just this difference.",
     ),
 ]
 

@@ -14,7 +14,7 @@ from jaxba.report import sentences
 from jaxba.scene import Finding
 
 FOCAL = Finding.of("focal moved", camera="DJI", parameter="fx", value=1165.0, before=929.0)
-OFFSET = Finding.of("common offset", median_m=0.02, receiver_std_m=3.0)
+OFFSET = Finding.of("common offset", median_m=0.02, axes=["east"], receiver_std_m=[3.0])
 EDGES = Finding.of(
     "edges left out", names=[f"a{i}, b{i}" for i in range(13)], matches=[45] * 13, median_px=[5.0] * 13, limit_px=3.0
 )

@@ -1,5 +1,6 @@
 """The page of a report: what it says, what it escapes, and that a browser draws it without asking for anything."""
 
+import base64
 import copy
 import json
 import re
@@ -9,9 +10,11 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from report_sample import UNKNOWN, sample
 
+from jaxba.report.document._glossary import GLOSSARY
 from jaxba.report.page import page
 from jaxba.report.page._tables import UNKNOWN as UNKNOWN_NUMBER
 
@@ -22,7 +25,8 @@ SECTIONS = {
     "Accuracy by check points", "Photos", "What was left out", "Processing", "How every figure was computed",
 }  # fmt: skip
 MAY_BE_EMPTY = {
-    "cloud": ("preview", "space"), "overlap": ("overlap",), "residuals": ("residuals",), "positions": ("positions",),
+    "sigmas": (), "pairs": ("matches",), "cloud": ("preview", "space"),
+    "overlap": ("overlap",), "residuals": ("residuals",), "positions": ("positions",),
     "attitudes": ("attitudes",), "control": ("control",), "bars": ("bars",), "statistics": ("statistics",),
     "accuracy": ("accuracy",),
 }  # fmt: skip
@@ -68,6 +72,11 @@ class Seen(HTMLParser):
             self.headings[-1] += data.strip()
 
 
+def unpacked(part: dict[str, str]) -> np.ndarray:
+    """Return numbers that the page has packed."""
+    return np.frombuffer(base64.b64decode(part["bdata"]), np.dtype(part["dtype"]).newbyteorder("<"))
+
+
 @pytest.fixture(scope="module")
 def full() -> str:
     return page(sample())
@@ -108,9 +117,7 @@ def test_a_section_without_data_says_why(part: str) -> None:
 
 def test_a_run_that_has_just_begun_has_a_page() -> None:
     facts = sample(1, 1) | dict.fromkeys([*MAY_BE_EMPTY, "correlation"], UNKNOWN)
-    facts |= {
-        name: [] for name in ("quality", "findings", "summary", "photos", "pairs", "cameras", "left_out", "glossary")
-    }
+    facts |= {name: [] for name in ("quality", "findings", "summary", "photos", "cameras", "left_out", "glossary")}
     facts["project"] |= dict.fromkeys(
         ("crs", "crs_name", "unit", "height_unit", "heights", "first_photo", "last_photo")
     )
@@ -159,10 +166,42 @@ def test_a_small_frame_of_its_own_is_drawn_as_finely() -> None:
     facts["project"] |= dict.fromkeys(("crs", "crs_name", "unit", "height_unit", "heights"))
     for photo in facts["photos"]:
         photo |= {"x": photo["x"] and photo["x"] / 1e6, "y": photo["y"] and photo["y"] / 1e6, "measured": None}
-    graphs = [figure["data"] for figure in Seen(page(facts)).figures]
-    graph = next(data for data in graphs if any("matches or more" in trace.get("name", "") for trace in data))
-    ends = {value for trace in graph if trace["mode"] == "lines" for value in trace["x"]}
-    assert len(ends - {None}) == 21  # as many as photos: rounding has made none of them one
+    graph = next(figure for figure in Seen(page(facts)).figures if figure["places"])
+    places, ends = (unpacked(part) for part in (graph["places"], graph["data"][-3]["ends"]))
+    pairs = {(places[2 * k], places[2 * k + 1]) for k in range(24)} - {(0.0, 0.0)}
+    assert len(pairs) == 21 and ends.max() < 24  # as many as photos: rounding has made none of them one
+
+
+def test_lines_of_pairs_join_the_photos_that_were_matched(full: str) -> None:
+    facts = sample()
+    graph = next(figure for figure in Seen(full).figures if figure["places"])
+    found = [unpacked(trace["ends"]).reshape(-1, 2) for trace in graph["data"] if "ends" in trace]
+    joined = sorted(map(tuple, np.concatenate(found).tolist()))
+    assert joined == sorted(zip(facts["pairs"]["first"], facts["pairs"]["second"], strict=True))
+    places = unpacked(graph["places"]).reshape(-1, 2)
+    adjusted = [k for k, photo in enumerate(facts["photos"]) if photo["x"] is not None]
+    np.testing.assert_array_equal(places[adjusted], [[facts["photos"][k][axis] for axis in "xy"] for k in adjusted])
+
+
+def test_terms_of_the_glossary_are_the_words_of_the_page(full: str) -> None:
+    # breaks where a heading is renamed and the glossary is not, or the other way round
+    seen = Seen(full)
+    texts = " ".join(text for name, text in seen.sections.items() if name != "glossary").lower()
+    texts += "bundle adjustment" if "Bundle adjustment report" in full else ""
+    facts = sample()
+    facts["sigmas"]["scope"] = "within the block"
+    texts += Seen(page(facts)).sections["positions-map"].lower()
+    assert [term for term in GLOSSARY if term.lower() not in texts] == []
+
+
+def test_what_is_not_determined_and_what_sigmas_are_of_is_said(full: str) -> None:
+    seen = Seen(full)
+    assert seen.sections["positions"].count("not determined") == 2  # offset in common up, and its sigma
+    assert "Absolute accuracy" in seen.sections["positions-map"] and "absolute sigma east" in seen.sections["photos"]
+    assert "let go" in seen.sections["photos"] and "left out" in seen.sections["photos"]
+    assert "assumed beforehand" in seen.sections["statistics"] and "gcp_list.txt" in seen.sections["processing"]
+    for heading in ("redundancy number east", "internal reliability up", "external reliability north"):
+        assert heading in seen.sections["control"]
 
 
 def test_names_from_files_stay_text() -> None:
@@ -192,7 +231,13 @@ def test_the_page_asks_for_nothing_and_every_table_has_headings(full: str) -> No
 
 
 def test_a_large_block_stays_small_enough_to_send() -> None:
-    assert len(page(sample(500, 50_000)).encode()) < 8_000_000
+    facts = sample(500, 50_000)
+    assert len(page(facts).encode()) < 8_000_000
+    rng = np.random.default_rng(1)
+    facts["pairs"] = {
+        name: rng.integers(0, 400, 60_000).tolist() for name in ("first", "second", "matches", "putative")
+    } | {"state": ["good"] * 60_000, "median_px": [0.5] * 60_000, "angle_deg": [9.5] * 60_000}
+    assert len(page(facts).encode()) < 8_000_000
 
 
 def test_a_browser_draws_every_figure_and_asks_for_nothing(full: str, tmp_path: Path) -> None:
@@ -201,10 +246,17 @@ def test_a_browser_draws_every_figure_and_asks_for_nothing(full: str, tmp_path: 
         pytest.skip("needs Chromium, and there is none on the PATH")
     path = tmp_path / "report.html"
     path.write_text(full, "utf-8")
-    flags = [
+    flags = [  # a window that shows all of it, since the points in space wait until they are looked at
         *("--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"),
         *("--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"),
-        *("--disable-sync", "--enable-logging=stderr", "--v=0", "--virtual-time-budget=30000", "--dump-dom"),
+        *(
+            "--window-size=1200,30000",
+            "--disable-sync",
+            "--enable-logging=stderr",
+            "--v=0",
+            "--virtual-time-budget=30000",
+            "--dump-dom",
+        ),
     ]
     done = subprocess.run(
         [found, *flags, f"--user-data-dir={tmp_path / 'profile'}", path.as_uri()],

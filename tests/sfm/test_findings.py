@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxba.report import sentences
-from jaxba.scene import Block, Finding, LeftOut, PrunedEdge, Reference
+from jaxba.scene import AssumedDatum, Block, Finding, LeftOut, PrunedEdge, Reference
 from jaxba.sfm import Adjusted, Settings, Uncertainty, adjust, findings, gnss_fit, height_above_ground, with_points
 from jaxba.sfm._measured import position_scale
 from jaxba.simulation.staged import Simulated, simulate, true_block
@@ -167,7 +168,9 @@ def test_what_the_rounds_left_out_is_told(adjusted: Adjusted, survey: Simulated)
 
 def test_sigmas_of_a_single_receiver_are_explained(adjusted: Adjusted, survey: Simulated) -> None:
     plain = replace(survey.reference, std_m=np.full((12, 3), 3.0))
-    assert _findings(adjusted, survey, plain)["common offset"] == {"median_m": 0.02, "receiver_std_m": 3.0}
+    assert _findings(adjusted, survey, plain)["common offset"] == {
+        "median_m": 0.02, "axes": ["east", "north", "up"], "receiver_std_m": [3.0] * 3,
+    }  # fmt: skip
 
 
 def test_position_sigmas_are_those_of_the_axes_that_were_measured(adjusted: Adjusted, survey: Simulated) -> None:
@@ -180,7 +183,8 @@ def test_position_sigmas_are_those_of_the_axes_that_were_measured(adjusted: Adju
     )
     fit = gnss_fit(adjusted.block, without_heights)
     found = _by_kind(findings(adjusted, survey.block, sigmas, fit, without_heights, survey.photos))
-    assert found["common offset"] == {"median_m": 0.03, "receiver_std_m": 3.0} and "nan" not in str(found)
+    assert found["common offset"] == {"median_m": 0.03, "axes": ["east", "north"], "receiver_std_m": [3.0] * 2}
+    assert "nan" not in str(found)
 
 
 def test_a_finding_that_fails_costs_nothing_but_itself(
@@ -219,3 +223,48 @@ def test_sigmas_of_positions_stand_unless_their_scatter_contradicts_them(survey:
     apart = replace(survey.reference, xyz_m=centers + 0.02 * rng.normal(size=(12, 3)), std_m=np.full((12, 3), 0.02))
     apart.xyz_m[4] += 30.0
     assert (position_scale(block, apart) < 3).all()  # one fix that is off does not make the others worse
+
+
+@pytest.mark.parametrize(
+    ("turned", "about", "angle_deg", "quarters"),
+    [
+        ([3, 4, 8], (0, 0, 1), 180.0, 2),
+        ([3, 4, 8], (0, 0, 1), -90.0, 3),
+        (range(12), (0, 0, 1), 90.0, 1),
+        ([5], (1, 0, 0), 60.0, 0),
+        ([5], (0, 0, 1), 60.0, 0),
+    ],
+)
+def test_attitudes_that_no_gimbal_errs_by_are_named_with_the_turn_of_the_picture(
+    adjusted: Adjusted, survey: Simulated, turned: Sequence[int], about: tuple, angle_deg: float, quarters: int
+) -> None:
+    # the camera's frame of the tags against that of the block, in matrices: a picture that was turned after the flight
+    measured = Rotation.from_quat(adjusted.block.quaternion, scalar_first=True).as_matrix()
+    for row in turned:
+        angle = np.radians(angle_deg)
+        measured[row] = Rotation.from_rotvec(-angle * np.array(about, float)).as_matrix() @ measured[row]
+    quaternion = Rotation.from_matrix(measured).as_quat(scalar_first=True)
+    std = np.full((12, 3), np.radians([2.0, 2.0, 5.0]))
+    found = _findings(adjusted, survey, replace(survey.reference, quaternion=quaternion, attitude_std_rad=std))
+    of = found["attitudes contradict"]
+    assert of["names"] == [survey.photos[row].name for row in turned] and of["measured"] == 12
+    np.testing.assert_allclose(of["turn_deg"], abs(angle_deg), atol=1.0)
+    assert of["quarter_turns"] == quarters
+
+
+@pytest.mark.parametrize(("angle_deg", "yaw_std_deg"), [(40.0, 5.0), (170.0, 180.0)])
+def test_attitudes_within_their_sigmas_or_a_bad_compass_are_no_finding(
+    adjusted: Adjusted, survey: Simulated, angle_deg: float, yaw_std_deg: float
+) -> None:
+    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(angle_deg)])
+    quaternion = (turn * Rotation.from_quat(adjusted.block.quaternion, scalar_first=True)).as_quat(scalar_first=True)
+    std = np.full((12, 3), np.radians([2.0, 2.0, yaw_std_deg]))
+    found = _findings(adjusted, survey, replace(survey.reference, quaternion=quaternion, attitude_std_rad=std))
+    assert "attitudes contradict" not in found
+
+
+def test_heights_whose_datum_was_assumed_are_told(adjusted: Adjusted, survey: Simulated) -> None:
+    assumed = AssumedDatum(("photos", "gcp_list.txt"), "unknown")
+    reference = replace(survey.reference, assumed_datum=assumed)
+    found = _findings(adjusted, survey, reference)
+    assert found["height datum assumed"] == {"of": ["photos", "gcp_list.txt"], "datum": "unknown"}

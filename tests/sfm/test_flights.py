@@ -88,11 +88,12 @@ def test_offsets_are_told_with_their_sigmas() -> None:
     )
     flights.std_m[0] = 0.05
     facts = flight_facts(flights)
-    assert facts[0] == {"flight": 1, "photos": 3, "offset_m": [0.1, -0.2, 0.3], "std_m": [0.05] * 3}
+    assert facts[0] == {"flight": 1, "photos": 3, "offset_m": [-0.1, 0.2, -0.3], "std_m": [0.05] * 3}
     assert facts[1]["std_m"] == [None] * 3 and flight_facts(None) == []
     assert flight_lines(facts) == [
-        "1, 3 photos: positions off by +0.100 (0.050), -0.200 (0.050), +0.300 (0.050) m east, north, up",
-        "3, 4 photos: positions off by +0.000, +0.000, +1.000 m east, north, up",
+        "1, 3 photos: adjusted minus measured positions in common -0.100 (0.050), +0.200 (0.050), -0.300 (0.050) m "
+        "east, north, up",
+        "3, 4 photos: adjusted minus measured positions in common +0.000, +0.000, -1.000 m east, north, up",
     ]
 
 

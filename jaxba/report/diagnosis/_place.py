@@ -95,8 +95,9 @@ def _control_far_off(case: Recorded) -> Diagnosis | None:
         return None
     return Diagnosis(
         name="far off",
-        cause=f"The measured positions lie {_length(across)} from where control puts them, all alike (east "
-        f"{away_m[0]:+.1f} m, north {away_m[1]:+.1f} m): control in another zone, or with swapped axes.",
+        cause=f"The measured positions lie {_length(across)} from where control puts them, all alike (adjusted "
+        f"minus measured: east {-away_m[0]:+.1f} m, north {-away_m[1]:+.1f} m): control in another zone, or with "
+        "swapped axes.",
         cure="Compare the CRS in the first line of the list of control points with that of its coordinates; x (east) "
         "comes first.",
         figures={"gnss_minus_control_m": away_m.tolist()},
@@ -113,8 +114,8 @@ def _control_of_another_datum(case: Recorded) -> Diagnosis | None:
     above = "" if frame is None else f" Heights of the photos are {frame.height_datum}"
     return Diagnosis(
         name="mixed datum",
-        cause=f"All measured positions are off from control by the same (east {away_m[0]:+.1f} m, north "
-        f"{away_m[1]:+.1f} m, up {away_m[2]:+.1f} m): they are in two datums.{above} "
+        cause=f"All measured positions are off from control by the same (adjusted minus measured: east "
+        f"{-away_m[0]:+.1f} m, north {-away_m[1]:+.1f} m, up {-away_m[2]:+.1f} m): they are in two datums.{above} "
         f"(crs.height_datum={settings['crs'].height_datum}), those of control are taken "
         f"control.height_datum={settings['control'].height_datum}; a geoid lies up to 100 m off the ellipsoid.",
         cure="Say what each is above: control.height_datum and crs.height_datum, ellipsoidal, mean_sea_level, or a "

@@ -12,7 +12,7 @@ _EAST_NORTH_UP = "east", "north", "up"
 _ENTRIES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("measured", "surveyed", "adjusted"), ("x", "y", "z")),
     **dict.fromkeys(
-        ("std_m", "residual_m", "survey_std_m", "without_m", "without_std_m", "detectable_m", "reach_m"),
+        ("std_m", "residual_m", "survey_std_m", "without_m", "without_std_m", "redundancy", "detectable_m", "reach_m"),
         _EAST_NORTH_UP,
     ),
     "ellipse_m": ("a_m", "b_m", "azimuth_deg"),
@@ -30,7 +30,7 @@ def tables(facts: Mapping[str, Any]) -> dict[str, bytes]:
     ['name,std_east_m,std_north_m,std_up_m', 'a.jpg,0.1,0.2,']
     """
     names = [photo["name"] for photo in facts.get("photos", ())]
-    pairs = [pair | {side: names[pair[side]] for side in ("first", "second")} for pair in facts.get("pairs", ())]
+    pairs = _pairs(facts.get("pairs", {}), names)
     intrinsics = [
         {"camera": camera["name"], **parameter}
         for camera in facts.get("cameras", ())
@@ -51,6 +51,13 @@ def tables(facts: Mapping[str, Any]) -> dict[str, bytes]:
     return {f"{name}.csv": _csv(rows) for name, rows in found.items() if rows}
 
 
+def _pairs(found: Mapping[str, Any], names: Sequence[str]) -> list[dict[str, Any]]:
+    if "none" in found or not found:
+        return []
+    rows = [dict(zip(found, values, strict=True)) for values in zip(*found.values(), strict=True)]
+    return [row | {side: names[row[side]] for side in ("first", "second")} for row in rows]
+
+
 def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
     flat = [_flat(row) for row in rows]
     columns = list(dict.fromkeys(column for row in flat for column in row))
@@ -67,7 +74,7 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
         if name in _DRAWN:
             continue
         entries = _ENTRIES.get(name)
-        if entries is not None:
+        if entries is not None and not (name == "redundancy" and not isinstance(value, list)):
             values = value if isinstance(value, list) else [value] * len(entries)
             flat |= {_column(name, entry): _cell(of) for entry, of in zip(entries, values, strict=True)}
         else:

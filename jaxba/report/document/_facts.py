@@ -6,32 +6,24 @@ The form is told in `_schema.py`. Numbers that are not known are None; a section
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import jaxba
-from jaxba.engine._project import SETTINGS, SUMMARY, TIMES, Project
+from jaxba.engine._project import SETTINGS, SUMMARY, TIMES, Project, list_paths
 from jaxba.engine._settings import from_toml
 from jaxba.engine._stage import Pipeline, left_out
+from jaxba.engine._store import sha256
 from jaxba.engine._versions import installed
 from jaxba.report._findings import sentences
 from jaxba.report._recorded import Recorded, recorded
 from jaxba.report._summary import finite
+from jaxba.report.document._calibration import cameras, correlation, statistics
 from jaxba.report.document._glossary import GLOSSARY
-from jaxba.report.document._lights import gsd_m, lights, verdict
+from jaxba.report.document._key_figures import key_figures
+from jaxba.report.document._lights import lights, verdict
 from jaxba.report.document._material import Material
-from jaxba.report.document._photos import cloud, overlap, pair_rows, photo_rows
+from jaxba.report.document._photos import cloud, overlap, pairs, photo_rows
 from jaxba.report.document._residuals import residuals
-from jaxba.report.document._survey import (
-    accuracy_section,
-    attitudes,
-    bars,
-    cameras,
-    control,
-    correlation,
-    place,
-    positions,
-    statistics,
-)
+from jaxba.report.document._sigmas import sigmas
+from jaxba.report.document._survey import accuracy_section, attitudes, bars, control, place, positions
 
 SCHEMA = 1
 
@@ -53,30 +45,33 @@ def report_facts(folder: Path, pipeline: Pipeline) -> dict[str, Any]:
         seconds=seconds if isinstance(seconds, dict) else {},
     )
     rows = lights(material)
+    photos = photo_rows(material)
     facts = {
         "schema": SCHEMA,
         "project": _project(material, project),
         "verdict": verdict(material, rows),
         "quality": rows,
         "findings": sentences(found.findings),
-        "summary": _summary(material),
+        "summary": [],
+        "sigmas": sigmas(material),
         "cloud": cloud(material),
-        "photos": photo_rows(material),
-        "pairs": pair_rows(material),
+        "photos": photos,
+        "pairs": pairs(material),
         "overlap": overlap(material),
         "residuals": residuals(material),
         "cameras": cameras(material),
         "correlation": correlation(material),
-        "positions": positions(material),
+        "positions": positions(material, photos),
         "attitudes": attitudes(material),
         "control": control(material),
         "bars": bars(material),
         "statistics": statistics(material),
         "accuracy": accuracy_section(material),
         "left_out": _left_out(material, pipeline),
-        "processing": _processing(material, pipeline),
+        "processing": _processing(material, project, pipeline),
         "glossary": [{"term": term, "text": text} for term, text in GLOSSARY.items()],
     }
+    facts["summary"] = key_figures(material, facts)
     plain: dict[str, Any] = finite(facts)
     return plain
 
@@ -113,38 +108,6 @@ def _state(found: Recorded) -> tuple[str, str | None]:
     return "complete", None
 
 
-def _summary(material: Material) -> list[dict[str, str]]:
-    adjusted = material.adjusted
-    rows = [("Photos", f"{len(material.photos):,}")]
-    if adjusted is None:
-        return [{"name": name, "value": value} for name, value in rows]
-    block = adjusted.block
-    views = np.bincount(block.observation_point, minlength=block.num_points)
-    gsd = gsd_m(material)
-    rows = [
-        ("Photos adjusted", f"{block.num_images:,} of {len(material.photos):,}"),
-        ("Cameras", f"{len(block.camera_names)}"),
-        ("Points", f"{block.num_points:,}"),
-        ("Points in three photos or more", f"{int((views > 2).sum()):,}"),
-        ("Image points", f"{block.num_observations:,}"),
-        ("Image points rejected", f"{adjusted.num_rejected:,}"),
-        ("Median reprojection error", f"{adjusted.median_px:.2f} px"),
-        ("Sigma of an image coordinate", f"{adjusted.std_px * adjusted.spread:.2f} px"),
-        ("Rounds of adjustment", f"{adjusted.rounds}"),
-    ]
-    if np.isfinite(gsd):
-        rows.append(("Ground sample distance", f"{100 * gsd:.2f} cm/px"))
-    known = np.isfinite(adjusted.position_std_m).all(axis=1)
-    if known.any():
-        median = ", ".join(f"{value:.3f}" for value in np.median(adjusted.position_std_m[known], axis=0))
-        rows.append(("Sigma of a camera, median", f"{median} m east, north, up"))
-    known = np.isfinite(adjusted.point_std_m).all(axis=1)
-    if known.any():
-        median = ", ".join(f"{value:.3f}" for value in np.median(adjusted.point_std_m[known], axis=0))
-        rows.append(("Sigma of a point, median", f"{median} m east, north, up"))
-    return [{"name": name, "value": value} for name, value in rows]
-
-
 def _left_out(material: Material, pipeline: Pipeline) -> list[dict[str, str]]:
     return [
         {"stage": stage, "name": entry.name, "reason": entry.reason}
@@ -153,7 +116,7 @@ def _left_out(material: Material, pipeline: Pipeline) -> list[dict[str, str]]:
     ]
 
 
-def _processing(material: Material, pipeline: Pipeline) -> dict[str, Any]:
+def _processing(material: Material, project: Project, pipeline: Pipeline) -> dict[str, Any]:
     """Return parameters, stages with their times, versions, and hashes of what came in and went out."""
     done = material.done
     parameters = []
@@ -178,11 +141,21 @@ def _processing(material: Material, pipeline: Pipeline) -> dict[str, Any]:
             for name in pipeline.names
         ],
         "versions": [{"name": name, "version": version} for name, version in sorted(installed().items())],
-        "inputs": [{"name": photo.name, "sha256": photo.sha256} for photo in material.photos],
+        "inputs": [*_lists(project), *({"name": p.name, "what": "photo", "sha256": p.sha256} for p in material.photos)],
         "outputs": []
         if exported is None
         else [{"name": n, "sha256": h} for n, h in zip(exported.files, exported.sha256, strict=True)],
     }
+
+
+def _lists(project: Project) -> list[dict[str, str]]:
+    """Return the lists that the run was given, or found among the photos."""
+    given, _ = project.read_given()
+    return [
+        {"name": path.name, "what": what, "sha256": sha256(path)}
+        for what, path in list_paths(given).items()
+        if path is not None
+    ]
 
 
 def _text(value: Any) -> str:

@@ -65,6 +65,12 @@ class Material:
             return None
         return self.reference.frame
 
+    @property
+    def let_go(self) -> set[str]:
+        """Names of the photos whose measured position contradicts the block, so that it hardly counts."""
+        found = [finding for finding in self.found.findings if finding.kind == "positions contradict"]
+        return {name for finding in found for name in finding.figures["names"]}
+
     def in_crs(self, xyz_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return places of the local frame in the target CRS; as they are where there is none."""
         from jaxba import geo
@@ -80,6 +86,17 @@ class Material:
     def errors(self) -> "Errors | None":
         """Errors of all observations of the block's points, also of those left out; None before the adjustment."""
         return None if self.adjusted is None else _errors(self.adjusted.block, self.done.tracks.tracks)
+
+
+def gsd_m(material: Material) -> float:
+    """Return the median ground sample distance of the adjusted photos, metres a pixel; NaN where it is not known."""
+    adjusted = material.adjusted
+    if adjusted is None or not adjusted.block.is_georeferenced:
+        return np.nan
+    from jaxba.sfm import height_above_ground
+
+    block = adjusted.block
+    return float(np.nanmedian(height_above_ground(block) / block.camera_parameters[block.camera_index, 0]))
 
 
 @dataclass(frozen=True, eq=False)

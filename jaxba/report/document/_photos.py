@@ -9,6 +9,7 @@ from jaxba.scene import Block, EdgeStatus
 
 _SHOWN_POINTS = 50_000
 _CELLS = 90  # of the overlap map, along its longer side
+_OVERLAPPING = 2  # photos that see a piece of ground, for it to be measured
 _LEAST_DOWN = 0.17  # sine of the angle at which a photo's corner looks down
 _FROM_ABOVE = 0.002  # share of the points on each side that may lie outside the overlap map
 
@@ -24,7 +25,7 @@ def photo_rows(material: Material) -> list[dict[str, Any]]:
     if done.match is not None:
         edges = done.match.view_graph
         partners = np.bincount(edges.pairs[edges.is_edge].reshape(-1), minlength=len(material.photos))
-    measured = _measured(material)
+    measured, let_go = _measured(material), material.let_go
     rows = []
     for k, photo in enumerate(material.photos):
         row: dict[str, Any] = {
@@ -33,12 +34,12 @@ def photo_rows(material: Material) -> list[dict[str, Any]]:
             "state": "adjusted" if k in adjusted else "not adjusted",
             "reason": None if k in adjusted else reasons.get(photo.name, "it is not in the adjusted block"),
             "measured": measured[k],
-            "position": "none" if measured[k] is None else "gated",
+            "position": "none" if measured[k] is None else "left out",
             "keypoints": keypoints.get(k),
             "partners": int(partners[k]),
         }
         if measured[k] is not None and material.reference is not None and material.reference.is_used[k]:
-            row["position"] = "used"
+            row["position"] = "let go" if photo.name in let_go else "used"
         rows.append(row | adjusted.get(k, _NOTHING))
     if done.metadata is not None:
         empty = {"time": None, "measured": None, "position": "none", "keypoints": None, "partners": 0} | _NOTHING
@@ -68,7 +69,7 @@ def _adjusted_rows(material: Material) -> dict[int, dict[str, Any]]:
         return {}
     block: Block = adjusted.block
     xyz = material.mapped(block.centers_m)
-    angles = _angles(material)
+    angles, residual_m = _angles(material), _residuals(material)
     std_m, outlines = adjusted.position_std_m, _outlines(material)
     rows = {}
     order = np.argsort(block.observation_image, kind="stable")
@@ -80,7 +81,7 @@ def _adjusted_rows(material: Material) -> dict[int, dict[str, Any]]:
             **dict(zip("xyz", xyz[row].tolist(), strict=True)),
             "std_m": std_m[row].tolist(),
             "ellipse_m": _ellipse(material, row),
-            "residual_m": adjusted.gnss_residual_m[row].tolist(),
+            "residual_m": residual_m[row].tolist(),
             "omega_phi_kappa_deg": None if angles is None else angles[row].tolist(),
             "outline": outlines[row],
             "observations": len(errors),
@@ -89,6 +90,20 @@ def _adjusted_rows(material: Material) -> dict[int, dict[str, Any]]:
             "max_px": float(known.max()) if len(known) else None,
         }
     return rows
+
+
+def _residuals(material: Material) -> np.ndarray:
+    """Return adjusted minus measured positions, also of those that took no part, less what their flight is off."""
+    from jaxba.sfm import without_offsets
+
+    adjusted, reference = material.adjusted, material.reference
+    residual_m = adjusted.gnss_residual_m
+    if reference is None or not adjusted.block.is_georeferenced:
+        return residual_m
+    index = adjusted.block.image_index
+    measured_m = without_offsets(reference, adjusted.flights).xyz_m[index]
+    left_out = ~reference.is_used[index, None] & np.isfinite(reference.std_m[index])
+    return np.where(left_out, adjusted.block.centers_m - measured_m, residual_m)
 
 
 def _angles(material: Material) -> np.ndarray | None:
@@ -157,32 +172,31 @@ def _ellipse(material: Material, row: int) -> list[float] | None:
     return [semi_axes[1], semi_axes[0], float(np.degrees(np.arctan2(vectors[0, 1], vectors[1, 1])) % 180.0)]
 
 
-def pair_rows(material: Material) -> list[dict[str, Any]]:
-    """Return the pairs that were matched; `rejected` ones have no edge, the block refutes `pruned` ones."""
+def pairs(material: Material) -> dict[str, Any]:
+    """Return the pairs that were matched, a list a figure; `rejected` ones have no edge, the block refutes `pruned`.
+
+    A block of 500 photos has 10,000 pairs and more: as an object each they would be most of the report.
+    """
     done = material.done
     if done.match is None:
-        return []
+        return {"none": "Photos have not been matched."}
     graph = done.match.view_graph
     pruned = set() if material.adjusted is None else {edge.name for edge in material.adjusted.pruned}
     names = [photo.name for photo in material.photos]
     words = {EdgeStatus.REJECTED: "rejected", EdgeStatus.WEAK: "weak", EdgeStatus.GOOD: "good"}
-    rows = []
+    states = [words[EdgeStatus(status)] for status in graph.status.tolist()]
     for k, (first, second) in enumerate(graph.pairs.tolist()):
-        state = words[EdgeStatus(int(graph.status[k]))]
         if f"{names[first]}, {names[second]}" in pruned:
-            state = "pruned"
-        rows.append(
-            {
-                "first": first,
-                "second": second,
-                "matches": int(graph.num_inliers[k]),
-                "putative": int(graph.num_putative[k]),
-                "state": state,
-                "median_px": float(graph.residual_px[k]),
-                "angle_deg": float(np.degrees(graph.angle_rad[k])),
-            }
-        )
-    return rows
+            states[k] = "pruned"
+    return {
+        "first": graph.pairs[:, 0].tolist(),
+        "second": graph.pairs[:, 1].tolist(),
+        "matches": graph.num_inliers.tolist(),
+        "putative": graph.num_putative.tolist(),
+        "state": states,
+        "median_px": np.round(graph.residual_px, 3).astype(float).tolist(),
+        "angle_deg": np.round(np.degrees(graph.angle_rad), 3).astype(float).tolist(),
+    }
 
 
 def cloud(material: Material) -> dict[str, Any]:
@@ -240,6 +254,8 @@ def overlap(material: Material) -> dict[str, Any]:
         "x0": float(corners[0, 0]),
         "y0": float(corners[0, 1]),
         "cell": float(np.hypot(*(corners[1] - corners[0])[:2])),
+        "area_m2": float((seen >= _OVERLAPPING).sum() * cell**2),
+        "median": float(np.median(seen[seen > 0])) if (seen > 0).any() else np.nan,
         "rows": seen.reshape(ny, nx).tolist(),
     }
 

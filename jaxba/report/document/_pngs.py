@@ -83,22 +83,23 @@ def _map(figure: "Figure", facts: Facts) -> None:
     axes.scatter(*places[adjusted].T, s=16, color=_BLUE, label="adjusted", zorder=3)
     axes.scatter(*places[~adjusted].T, s=40, color=INK, marker="x", label="not adjusted, where it was measured")
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
-    said = f"ellipses of one sigma, {times:g} times as large" if sizes else "no sigmas are known"
+    scope = facts["sigmas"].get("scope", "")
+    said = f"ellipses of one sigma, {scope}, {times:g} times as large" if sizes else "no sigmas are known"
     titles(figure, "Cameras", f"{int(adjusted.sum())} of {len(photos)} photos adjusted; {said}")
 
 
 def _matches(figure: "Figure", facts: Facts) -> None:
     from matplotlib.collections import LineCollection
 
-    places = _places(facts)
+    places, found = _places(facts), facts["pairs"]
+    ends, states = np.array([found["first"], found["second"]]).T, np.array(found["state"])
     axes = _map_axes(figure, facts, places)
     for state, (colour, width) in _STATES.items():
-        mine = [pair for pair in facts["pairs"] if pair["state"] == state]
-        lines = np.array([[places[pair["first"]], places[pair["second"]]] for pair in mine]).reshape(-1, 2, 2)
+        lines = places[ends[states == state]]
         axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=width, alpha=0.5, label=state))
     axes.scatter(*places.T, s=14, color=INK, zorder=3)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
-    counts = [sum(pair["state"] == state for pair in facts["pairs"]) for state in (*_STATES, "rejected")]
+    counts = [found["state"].count(state) for state in (*_STATES, "rejected")]
     titles(figure, "Pairs of photos with matches", "{} good, {} weak, {} pruned; {} rejected ones".format(*counts))
 
 

@@ -1,5 +1,6 @@
-"""Sections on what was measured beside the photos: cameras, positions, attitudes, control, scale bars, statistics."""
+"""Sections on what was measured beside the photos: positions, attitudes, control, scale bars, accuracy."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,69 +8,14 @@ import numpy as np
 from jaxba.report._accuracy import Accuracy, accuracy, accuracy_row
 from jaxba.report._bars import bar_facts
 from jaxba.report._control import control_facts
-from jaxba.report._statistics import statistics_facts
 from jaxba.report.document._material import NOT_ADJUSTED, Material
 from jaxba.scene import Block, FlightOffsets, LocalFrame
 
-_LENGTHS = "f", "fx", "fy", "cx", "cy"
+_TOLD = np.sqrt(0.5)  # of a prior's sigma: beyond it measurements tell less than the prior
 
 
-def cameras(material: Material) -> list[dict[str, Any]]:
-    """Return each camera with its intrinsics: at the start, adjusted, and their sigmas."""
-    from jaxba.geometry import CAMERAS
-
-    adjusted = material.adjusted
-    if adjusted is None:
-        return []
-    block: Block = adjusted.block
-    names = CAMERAS[block.camera_model].parameter_names()
-    start = {name: row for name, row in zip(*_start(material), strict=True)}
-    found = []
-    for number, camera in enumerate(block.camera_names):
-        mine = np.flatnonzero(block.camera_index == number)
-        photo = material.photos[int(block.image_index[mine[0]])] if len(mine) else None
-        before = start.get(camera)
-        found.append(
-            {
-                "name": camera,
-                "model": block.camera_model,
-                "num_photos": len(mine),
-                "width_px": None if photo is None else photo.width_px,
-                "height_px": None if photo is None else photo.height_px,
-                "parameters": [
-                    {
-                        "name": name,
-                        "unit": "px" if name in _LENGTHS else "",
-                        "start": None if before is None else float(before[k]),
-                        "value": float(block.camera_parameters[number, k]),
-                        "std": float(adjusted.intrinsics_std[number, k]),
-                        "fixed": bool(adjusted.intrinsics_std[number, k] == 0),
-                    }
-                    for k, name in enumerate(names)
-                ],
-            }
-        )
-    return found
-
-
-def _start(material: Material) -> tuple[tuple[str, ...], np.ndarray]:
-    block = material.done.start.block
-    same = block.camera_model == material.adjusted.block.camera_model
-    return (block.camera_names, block.camera_parameters) if same else ((), np.zeros((0, 0)))
-
-
-def correlation(material: Material) -> dict[str, Any]:
-    """Return the correlations among what images share."""
-    if material.adjusted is None:
-        return {"none": NOT_ADJUSTED}
-    found = material.adjusted.statistics
-    if found is None or not len(found.unknowns):
-        return {"none": "Sigmas of what images share were not computed."}
-    return {"names": list(found.unknowns), "matrix": found.correlation.tolist()}
-
-
-def positions(material: Material) -> dict[str, Any]:
-    """Return how the adjusted positions of cameras fit the measured ones."""
+def positions(material: Material, photos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return how the adjusted positions of cameras fit the measured ones; `photos`: the rows of photos."""
     adjusted, reference = material.adjusted, material.reference
     if adjusted is None:
         return {"none": NOT_ADJUSTED}
@@ -77,11 +23,15 @@ def positions(material: Material) -> dict[str, Any]:
     used = np.isfinite(residual).any(axis=1)
     if reference is None or not used.any():
         return {"none": "No position of a photo was used."}
+    let_go = material.let_go
+    used &= np.array([material.photos[i].name not in let_go for i in adjusted.block.image_index])
     stated = np.where(np.isfinite(residual[used]), reference.std_m[adjusted.block.image_index[used]], np.nan)
     median = [float(np.median(c[np.isfinite(c)])) if np.isfinite(c).any() else np.nan for c in stated.T]
-    common, common_std = _common(material)
+    common, common_std = common_offset(material)
     return {
         "num": int(used.sum()),
+        "num_let_go": len(let_go),
+        "num_left_out": sum(row["position"] == "left out" for row in photos),
         "mean_m": _by_axis(residual[used], np.mean),
         "rms_m": _by_axis(residual[used], lambda values: np.sqrt(np.mean(values**2))),
         "stated_m": median,
@@ -99,19 +49,26 @@ def _flights(found: FlightOffsets | None) -> list[dict[str, Any]]:
         {
             "number": int(found.number[k]),
             "num_photos": int(found.num_photos[k]),
-            "offset_m": found.offset_m[k].tolist(),
+            "offset_m": (-found.offset_m[k]).tolist(),
             "std_m": found.std_m[k].tolist(),
         }
         for k in range(len(found.number))
     ]
 
 
-def _common(material: Material) -> tuple[list[float] | None, list[float] | None]:
-    """Return what all positions are off in common, measured minus adjusted, and its sigma, where control tells it."""
-    fit = material.adjusted.control
-    if not np.isfinite(fit.gnss_minus_control_m).any():
+def common_offset(material: Material) -> tuple[list[float] | None, list[float] | None]:
+    """Return what all positions have in common, adjusted minus measured, and its sigma, where control tells it.
+
+    NaN along an axis whose sigma is hardly less than the one that was assumed before: nothing has told it there.
+    """
+    fit, prior = material.adjusted.control, material.adjusted.common
+    std_m = fit.gnss_minus_control_std_m
+    is_told = np.isfinite(fit.gnss_minus_control_m)
+    if prior is not None and fit.method == "adjust":
+        is_told &= ~(std_m >= _TOLD * prior.std_m)
+    if not is_told.any():
         return None, None
-    return fit.gnss_minus_control_m.tolist(), fit.gnss_minus_control_std_m.tolist()
+    return np.where(is_told, -fit.gnss_minus_control_m, np.nan).tolist(), np.where(is_told, std_m, np.nan).tolist()
 
 
 def _by_axis(values: np.ndarray, figure: Any) -> list[float]:
@@ -119,7 +76,11 @@ def _by_axis(values: np.ndarray, figure: Any) -> list[float]:
 
 
 def attitudes(material: Material) -> dict[str, Any]:
-    """Return by what small turns the adjusted attitudes differ from those measured, about east, north and up."""
+    """Return how the adjusted attitudes differ from those measured: their heading, about up, and then their tilt.
+
+    Angles are on a circle. The mean is the direction of the mean of unit vectors, and the spread about it is the
+    circular standard deviation sqrt(-2 ln R) of their length R (Mardia and Jupp 2000, section 2.3).
+    """
     from scipy.spatial.transform import Rotation
 
     adjusted, reference = material.adjusted, material.reference
@@ -134,17 +95,29 @@ def attitudes(material: Material) -> dict[str, Any]:
         return {"none": "No photo has an attitude of its camera."}
     one = Rotation.from_quat(block.quaternion[known], scalar_first=True).inv()
     other = Rotation.from_quat(measured[known], scalar_first=True).inv()
-    turn_deg = np.degrees((one * other.inv()).as_rotvec())
+    turn: Any = one * other.inv()
+    w, _, _, z = turn.as_quat(scalar_first=True).T
+    heading = 2 * np.arctan2(z, w)
+    tilt = (turn * Rotation.from_rotvec(np.outer(-heading, [0.0, 0.0, 1.0]))).as_rotvec()
+    angles = np.exp(1j * np.column_stack([tilt[:, :2], heading])).mean(axis=0)
+    contradict = [finding for finding in material.found.findings if finding.kind == "attitudes contradict"]
     return {
         "num": int(known.sum()),
         "names": ["about east", "about north", "about up"],
-        "mean_deg": turn_deg.mean(axis=0).tolist(),
-        "rms_deg": np.sqrt(np.mean(turn_deg**2, axis=0)).tolist(),
+        "mean_deg": np.degrees(np.angle(angles)).tolist(),
+        "spread_deg": np.degrees(np.sqrt(-2 * np.log(np.clip(np.abs(angles), 1e-12, 1.0)))).tolist(),
+        "contradict": [name for finding in contradict for name in finding.figures["names"]],
     }
 
 
 def control(material: Material) -> dict[str, Any]:
-    """Return control and check points with what they say of the block, and what would be seen of an error in each."""
+    """Return control and check points with what they say of the block, and what would be seen of an error in each.
+
+    The redundancy number r follows from the minimal detectable error d of a test with the noncentrality c, and from the
+    sigma s of the survey: d = c s / sqrt(r) (Baarda 1968).
+    """
+    from jaxba.ba import NONCENTRALITY
+
     given = None if material.done.control is None else material.done.control.control
     if given is None or not given.num_points:
         return {"none": "No control or check points were given (--gcp, --check)."}
@@ -155,11 +128,13 @@ def control(material: Material) -> dict[str, Any]:
     surveyed = np.where(np.isfinite(given.std_m), material.in_crs(given.xyz_m), np.nan)
     adjusted = material.in_crs(fit.adjusted_m) if frame is not None else fit.adjusted_m
     points = facts["points"]
+    redundancy = (NONCENTRALITY * given.std_m * fit.scale[[0, 0, 1]] / fit.detectable_m) ** 2
     for k, point in enumerate(points):
         point |= {
             "surveyed": surveyed[k].tolist(),
             "adjusted": adjusted[k].tolist(),
             "survey_std_m": given.std_m[k].tolist(),
+            "redundancy": redundancy[k].tolist(),
             "detectable_m": ["any" if value == np.inf else value for value in fit.detectable_m[k].tolist()],
         }
     is_check = given.is_check
@@ -182,17 +157,6 @@ def bars(material: Material) -> dict[str, Any]:
     if given is None or not given.num:
         return {"none": "No scale bars were given (--bars)."}
     return {"none": NOT_ADJUSTED} if material.adjusted is None else {"bars": bar_facts(given, material.adjusted.bars)}
-
-
-def statistics(material: Material) -> dict[str, Any]:
-    """Return how each kind of measurement scatters beside what it was taken for."""
-    if material.adjusted is None:
-        return {"none": NOT_ADJUSTED}
-    facts = statistics_facts(material.adjusted.statistics)
-    if facts is None:
-        return {"none": "Statistics were not computed, as there are no sigmas."}
-    factor = float(material.adjusted.variance_factor)
-    return {"redundancy": facts["redundancy"], "variance_factor": factor, "kinds": facts["kinds"]}
 
 
 def accuracy_section(material: Material) -> dict[str, Any]:

@@ -30,7 +30,27 @@ def write_report(folder: Path, pipeline: Pipeline) -> tuple[Path, dict[str, Any]
         for name, content in (*tables(facts).items(), *pngs(facts).items()):
             (partial / name).write_bytes(content)
     html = folder / f"{REPORT}.html"
-    for path, text in ((folder / f"{REPORT}.json", json.dumps(facts, indent=1) + "\n"), (html, page(facts))):
+    for path, text in ((folder / f"{REPORT}.json", f"{_json(facts)}\n"), (html, page(facts))):
         with write_atomically(path) as file:
             file.write(text.encode())
     return html, facts
+
+
+def _json(value: Any, indent: str = "") -> str:
+    """Return JSON with a line a field, and lists of plain values, which are most of a report, on one line each.
+
+    >>> print(_json({"schema": 1, "cloud": {"x": [1.5, None]}}))
+    {
+     "schema": 1,
+     "cloud": {
+      "x": [1.5, null]
+     }
+    }
+    """
+    inner = f"{indent} "
+    if isinstance(value, dict) and value:
+        fields = (f"{inner}{json.dumps(name)}: {_json(entry, inner)}" for name, entry in value.items())
+        return "{\n" + ",\n".join(fields) + f"\n{indent}}}"
+    if isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
+        return "[\n" + ",\n".join(f"{inner}{_json(entry, inner)}" for entry in value) + f"\n{indent}]"
+    return json.dumps(value)

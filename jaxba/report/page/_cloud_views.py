@@ -2,7 +2,8 @@
 
 The picture is drawn here, point by point, and laid under the axes. In space there are too many points for texts or full
 coordinates: x and y are counted from a round place near the middle, so that 32 bits are enough, and the axes are
-labelled with the full coordinates. Colours are at most 255, each a byte a point.
+labelled with the full coordinates. Colours are at most 255, each a byte a point. Points are squares, which are two
+triangles each and look alike at their size: without a graphics card 50,000 circles take 2.8 s to draw, squares 1.5 s.
 """
 
 import base64
@@ -145,14 +146,14 @@ def _modes(cloud: dict[str, Any], size: float, height_unit: str | None) -> list[
     if len(scale) == 1:  # Plotly wants both ends
         scale.append([1.0, scale[0][1]])
     colours = {"color": packed(np.asarray(few)[0], "u1"), "colorscale": scale, "cmin": 0, "cmax": last}
-    modes = [{"label": "Colours", "marker": {"size": size, **colours, "showscale": False}}]
+    modes = [{"label": "Colours", "marker": {"size": size, "symbol": "square", **colours, "showscale": False}}]
     for label, title, key in (
         ("Height", short_unit(height_unit), "z"),
         ("Reprojection error", "px", "error_px"),
         ("Sigma of height", "m", "std_z_m"),
     ):
         if cloud[key] is not None and any(value is not None for value in cloud[key]):
-            modes.append({"label": label, "marker": {"size": size, **_by_value(cloud[key], title)}})
+            modes.append({"label": label, "marker": {"size": size, "symbol": "square", **_by_value(cloud[key], title)}})
     return modes
 
 

@@ -33,6 +33,7 @@ class Figure:
 
     - `name`: in the page's addresses. `title`, `caption`: what it is and how to read it, for a customer.
     - `data`, `layout`: Plotly's. `ratio`: height over width of the room inside the axes, or `height_px` of the whole.
+    - `places`: x, y of what lines join, packed; a trace with `ends` draws lines between them by their numbers.
     - `modes`: ways to colour the first trace, which has no marker of its own: a label, and Plotly's `marker` for it.
     """
 
@@ -43,12 +44,13 @@ class Figure:
     layout: dict[str, Any]
     ratio: float | None = None
     height_px: int | None = None
+    places: dict[str, str] | None = None
     modes: list[dict[str, Any]] = field(default_factory=list)
 
     def json(self) -> str:
         """Return what `page.js` draws, as JSON that can stand inside a script element."""
         parts = {"data": self.data, "layout": self.layout, "modes": self.modes}
-        parts |= {"ratio": self.ratio, "height": self.height_px}
+        parts |= {"ratio": self.ratio, "height": self.height_px, "places": self.places}
         text = json.dumps(parts, allow_nan=False, separators=(",", ":"))
         return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

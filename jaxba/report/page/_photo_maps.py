@@ -1,4 +1,4 @@
-"""Maps of the photos: how well each position is known, how far it is from its GNSS position, overlap, and matches."""
+"""Maps of the photos: how well each position is known, how far it is from its GNSS position, and overlap."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,7 +8,6 @@ import numpy as np
 from jaxba.report.page._drawing import (
     BLUE,
     DIVERGING,
-    GREY,
     ORANGE,
     PURPLE,
     SKY,
@@ -32,7 +31,6 @@ from jaxba.report.page._drawing import (
 )  # fmt: skip
 
 _ELLIPSE_SIDES = 24
-_MOST_PAIRS_TO_POINT_AT = 1500  # each is an element of its own in the page, which is slow by the ten thousand
 _OVERLAP_COLOURS = ("#d55e00", "#f0a04b", "#f7d9a8", "#d6e6f2", "#a6cbe3", "#6ba6d0", "#3a83bd", "#12609e", "#083d73")
 
 
@@ -44,7 +42,7 @@ def sigma_map(report: dict[str, Any]) -> Figure | None:
     project = report["project"]
     area = map_of(project, [place(photo) for photo in placed]).with_room_below()
     sized = [photo for photo in placed if photo["x"] is not None and photo["ellipse_m"] is not None]
-    ellipses, shapes, caption = _ellipses(area, project, sized)
+    ellipses, shapes, caption = _ellipses(area, report, sized)
     layout = area.layout(shapes=[shape for shape, _ in shapes], annotations=[text for _, text in shapes])
     lost = len(report["photos"]) - len(placed)
     if lost:
@@ -60,13 +58,14 @@ def sigma_map(report: dict[str, Any]) -> Figure | None:
 def residual_map(report: dict[str, Any]) -> Figure | None:
     """Return the map of the differences from the GNSS positions; None where there is none."""
     adjusted = [photo for photo in report["photos"] if photo["x"] is not None]
-    gated = [photo for photo in adjusted if photo["position"] == "gated"]
+    apart = {kind: [photo for photo in adjusted if photo["position"] == kind] for kind in ("let go", "left out")}
     used = [photo for photo in adjusted if photo["position"] == "used" and photo["residual_m"] is not None]
     used = [photo for photo in used if None not in photo["residual_m"][:2]]
     unit_m = unit_metres(report["project"]["unit"])
     if not used or unit_m is None:
         return None
-    area = map_of(report["project"], [place(photo) for photo in used + gated]).with_room_below()
+    shown = [place(photo) for photos in (used, *apart.values()) for photo in photos]
+    area = map_of(report["project"], shown).with_room_below()
     off = np.array([photo["residual_m"][:2] for photo in used])
     here = np.array([place(photo) for photo in used])
     times = magnification(np.linalg.norm(off, axis=1), 1.4 * unit_m * spacing(here, area))
@@ -82,14 +81,16 @@ def residual_map(report: dict[str, Any]) -> Figure | None:
          "line": {"color": "@ink", "width": 1.2}, **arrows(here, here + off * times / unit_m)},
         photo_markers("position used", used, marker, "residual_m"),
     ]  # fmt: skip
-    if gated:
-        data.append(photo_markers("position set aside (no arrow)", gated, _gated(len(used)), "residual_m"))
+    for kind, photos in apart.items():
+        if photos:
+            data.append(photo_markers(f"position {kind} (no arrow)", photos, _apart(kind, len(used)), "residual_m"))
     return Figure(
         name="gnss", title="Differences from the GNSS positions", ratio=area.ratio, data=data,
         layout=area.layout(shapes=[shape], annotations=[text]),
         caption="Each arrow points the way from a photo's GNSS position to the adjusted one and is drawn "
         f"{enlarged(times)}; the colour is the difference in height. Arrows without a pattern are noise. Arrows that "
-        "agree with their neighbours tell of an offset.",
+        "agree with their neighbours tell of an offset. Positions that contradict the block were let go of; positions "
+        "that were left out took no part. The table of photos tells the differences of both.",
     )  # fmt: skip
 
 
@@ -129,35 +130,6 @@ def overlap_map(report: dict[str, Any]) -> Figure | None:
     )  # fmt: skip
 
 
-def match_graph(report: dict[str, Any]) -> Figure | None:
-    """Return the photos with a line for each pair that was matched; None where there is none."""
-    places = [place(photo) for photo in report["photos"]]
-    pairs = [pair for pair in report["pairs"] if places[pair["first"]] and places[pair["second"]]]
-    if not pairs:
-        return None
-    area = map_of(report["project"], [xy for xy in places if xy])
-    groups = list(_match_groups(pairs, marker_size(len(places), 1.0)))
-    data = [
-        {"type": "scatter", "mode": "lines", "name": name, "line": line, "hoverinfo": "skip",
-         "opacity": 0.5 if name == "rejected" else 1,
-         **line_of(np.array([[places[pair["first"]], places[pair["second"]]] for pair in group]))}
-        for name, line, group in groups
-    ]  # fmt: skip
-    if len(pairs) <= _MOST_PAIRS_TO_POINT_AT:
-        data.append(_pair_texts(report["photos"], places, pairs))
-    photos = [photo for photo in report["photos"] if place(photo)]
-    data.append(photo_markers("photo", photos, {"size": marker_size(len(photos), 7.0), "color": "@ink"}))
-    hidden = len(report["pairs"]) - len(pairs)
-    return Figure(
-        name="matches", title="Which photos are tied together", ratio=area.ratio, data=data, layout=area.layout(),
-        caption="Each line joins two photos that show the same ground; the stronger the line, the more matches tie "
-        "them together. A block with a gap in this net, or with a thin place, can bend there. Pairs that were "
-        "rejected show different ground, or their matches contradict each other; pairs that were pruned contradict "
-        "the rest of the block."
-        + (f" {hidden:,} pairs of photos without a position are not drawn." if hidden else ""),
-    )  # fmt: skip
-
-
 def place(photo: dict[str, Any]) -> tuple[float, float] | None:
     """Return where a photo stands on a map: where it was adjusted, or else where it was measured."""
     if photo["x"] is not None and photo["y"] is not None:
@@ -166,14 +138,15 @@ def place(photo: dict[str, Any]) -> tuple[float, float] | None:
     return None if measured is None or None in measured[:2] else (measured[0], measured[1])
 
 
-def _gated(count: int) -> dict[str, Any]:
-    """Return the marker of photos whose measured position was not trusted."""
-    return {"size": marker_size(count) + 2, "symbol": "diamond-open", "color": ORANGE, "line": {"width": 2}}
+def _apart(kind: str, count: int) -> dict[str, Any]:
+    """Return the marker of photos whose measured position was let go of or left out."""
+    symbol = {"let go": "square-open", "left out": "diamond-open"}[kind]
+    return {"size": marker_size(count) + 2, "symbol": symbol, "color": ORANGE, "line": {"width": 2}}
 
 
 def _by_kind(photos: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
     """Yield the photos in the ways in which they took part, those that were used by their sigma in height."""
-    kinds = [photo["position"] if photo["state"] == "adjusted" else photo["state"] for photo in photos]
+    kinds = [_kind(photo) for photo in photos]
     used = [photo for photo, kind in zip(photos, kinds, strict=True) if kind == "used"]
     up = [None if photo["std_m"] is None else photo["std_m"][2] for photo in used]
     size = marker_size(len(photos))
@@ -183,13 +156,20 @@ def _by_kind(photos: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
     for name, kind, marker in (
         ("adjusted", "used", coloured),
         ("adjusted, no GNSS position", "none", {"size": size, "symbol": "square", "color": BLUE}),
-        ("adjusted, GNSS position set aside", "gated", _gated(len(photos))),
+        ("adjusted, GNSS position let go", "let go", _apart("let go", len(photos))),
+        ("adjusted, GNSS position left out", "left out position", _apart("left out", len(photos))),
         ("not adjusted", "not adjusted", {"size": size + 1, "symbol": "x", "color": VERMILLION}),
-        ("left out", "left out", _gated(len(photos)) | {"symbol": "triangle-down-open", "color": PURPLE}),
+        ("left out", "left out", _apart("left out", len(photos)) | {"symbol": "triangle-down-open", "color": PURPLE}),
     ):
         chosen = [photo for photo, its_kind in zip(photos, kinds, strict=True) if its_kind == kind]
         if chosen:
             yield photo_markers(name, chosen, marker, "std_m")
+
+
+def _kind(photo: dict[str, Any]) -> str:
+    if photo["state"] != "adjusted":
+        return str(photo["state"])
+    return "left out position" if photo["position"] == "left out" else str(photo["position"])
 
 
 def photo_markers(name: str, photos: list[dict[str, Any]], marker: dict[str, Any], figures: str = "") -> dict[str, Any]:
@@ -213,9 +193,10 @@ def photo_markers(name: str, photos: list[dict[str, Any]], marker: dict[str, Any
 
 
 def _ellipses(
-    area: Map, project: dict[str, Any], photos: list[dict[str, Any]]
+    area: Map, report: dict[str, Any], photos: list[dict[str, Any]]
 ) -> tuple[list[dict[str, Any]], list[tuple[dict[str, Any], dict[str, Any]]], str]:
     """Return the ellipses, the bar that tells their scale, and what the caption says of them."""
+    project = report["project"]
     unit_m = unit_metres(project["unit"])
     if not photos:
         return [], [], "No sigmas of positions were computed, so there are no error ellipses."
@@ -239,56 +220,10 @@ def _ellipses(
         "fillcolor": "rgba(86,180,233,0.22)", "line": {"color": SKY, "width": 1.2}, **line_of(outlines),
     }  # fmt: skip
     text = (
-        "An ellipse shows how well a position is known horizontally, one sigma in each direction, and is drawn "
-        f"{enlarged(times)}; the colour is the sigma in height."
+        "An error ellipse shows how well a position is known horizontally, one sigma in each direction, and is "
+        f"drawn {enlarged(times)}; the colour is the sigma in height. {report['sigmas'].get('text', '')}".rstrip()
     )
     return [trace], [reference(area, times / unit_m)], text
-
-
-def _match_groups(
-    pairs: list[dict[str, Any]], width: float
-) -> Iterable[tuple[str, dict[str, Any], list[dict[str, Any]]]]:
-    """Yield name, line and pairs of what is drawn alike: what did not hold first, then by the number of matches.
-
-    - `width`: 1 for lines of the usual width, less where there are many.
-    """
-    for state, name, colour, dash in (
-        ("rejected", "rejected", VERMILLION, "dot"),
-        ("pruned", "pruned", PURPLE, "dashdot"),
-        ("weak", "weak", ORANGE, "dash"),
-    ):
-        group = [pair for pair in pairs if pair["state"] == state]
-        if group:
-            yield name, {"color": colour, "width": width, "dash": dash}, group
-    good = [pair for pair in pairs if pair["state"] == "good"]
-    if not good:
-        return
-    matches = np.array([pair["matches"] for pair in good])
-    steps = sorted({int(float(f"{value:.1g}")) for value in np.percentile(matches, [25, 50, 75]) if value >= 1})
-    kinds = np.digitize(matches, steps)
-    for k in range(len(steps) + 1):
-        low, high = (steps[k - 1] if k else int(matches.min())), (steps[k] - 1 if k < len(steps) else None)
-        group = [pair for pair, kind in zip(good, kinds, strict=True) if kind == k]
-        if group:
-            name = f"{low:,} matches or more" if high is None else f"{low:,} to {high:,}"
-            yield name, {"color": f"@step-{k + 4 - len(steps)}", "width": (0.8 + 0.5 * k) * width}, group
-
-
-def _pair_texts(photos: list[dict[str, Any]], places: list[Any], pairs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return unseen markers amid the lines that tell what each pair is."""
-    texts = []
-    for pair in pairs:
-        names = ", ".join(plain(photos[pair[end]]["name"]) for end in ("first", "second"))
-        facts = [f"{pair['matches']:,} of {pair['putative']:,} matches hold"]
-        facts += [] if pair["median_px"] is None else [f"median {pair['median_px']:.2f} px"]
-        facts += [] if pair["angle_deg"] is None else [f"rays meet at {pair['angle_deg']:.1f}°"]
-        texts.append(f"<b>{names}</b><br>{pair['state']}: {', '.join(facts)}")
-    middle = np.array([np.add(places[pair["first"]], places[pair["second"]]) / 2 for pair in pairs])
-    return {
-        "type": "scatter", "mode": "markers", "showlegend": False, "marker": {"size": 9, "color": GREY, "opacity": 0},
-        "x": middle[:, 0].tolist(), "y": middle[:, 1].tolist(), "text": texts,
-        "hovertemplate": "%{text}<extra></extra>",
-    }  # fmt: skip
 
 
 def _photos(count: int) -> str:

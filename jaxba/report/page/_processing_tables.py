@@ -30,5 +30,7 @@ def version_table(versions: Rows) -> Table:
 
 def hash_table(title: str, files: Rows) -> Table:
     """Return files with their hashes."""
-    rows = [[row["name"], row["sha256"]] for row in files]
-    return table(f"{title} ({len(rows):,})", [text("file"), text("SHA-256")], rows, is_closed=True)
+    whats = ["what"] if any("what" in row for row in files) else []
+    rows = [[row["name"], *(row[what] for what in whats), row["sha256"]] for row in files]
+    columns = [text("file"), *map(text, whats), Column(name="SHA-256", kind="hash")]
+    return table(f"{title} ({len(rows):,})", columns, rows, is_closed=True)

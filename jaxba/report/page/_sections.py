@@ -7,7 +7,8 @@ from typing import Any
 from jaxba.report.page._cloud_views import in_space, preview
 from jaxba.report.page._drawing import Figure
 from jaxba.report.page._error_charts import correlation, histogram, radial_profile, sensor_field
-from jaxba.report.page._photo_maps import match_graph, overlap_map, residual_map, sigma_map
+from jaxba.report.page._match_graph import match_graph
+from jaxba.report.page._photo_maps import overlap_map, residual_map, sigma_map
 from jaxba.report.page._photo_tables import camera_table, left_out_table, photo_table
 from jaxba.report.page._processing_tables import hash_table, parameter_table, stage_table, version_table
 from jaxba.report.page._survey_charts import control_chart, control_map, positions_chart
@@ -17,6 +18,7 @@ from jaxba.report.page._survey_tables import (
     bar_table,
     control_tables,
     position_tables,
+    sigma_blocks,
     statistics_table,
 )  # fmt: skip
 from jaxba.report.page._tables import Table, number
@@ -55,14 +57,15 @@ def sections(report: dict[str, Any]) -> list[Section]:
         _section(
             "positions-map", "Cameras and their accuracy",
             no_photos or (None if sigmas else "No photo has a place, neither by GNSS nor by the adjustment."),
-            sigmas, residual_map(report),
+            *_of(report["sigmas"], sigma_blocks), sigmas, residual_map(report),
         ),
         _section("overlap", "Overlap", _none(report["overlap"], "rows", "No photo sees the ground."),
                  overlap_map(report)),
         _section(
             "matches", "Matches between photos",
-            None if matches else "No photos that have a place were matched with each other.",
-            matches, _told_pairs(report),
+            _none(report["pairs"])
+            or (None if matches else "No photos that have a place were matched with each other."),
+            matches, _told_pairs(report) if matches else None,
         ),
         _section("space", "The block in three dimensions", no_points, in_space(report)),
         _section(
@@ -122,7 +125,7 @@ def _or_reason(found: dict[str, Any], figure: Figure | None) -> Iterable[Block]:
 
 def _told_pairs(report: dict[str, Any]) -> str:
     """Return how many pairs there are of each state."""
-    states = [pair["state"] for pair in report["pairs"]]
+    states = report["pairs"]["state"]
     counts = [(state, states.count(state)) for state in ("good", "weak", "rejected", "pruned")]
     return f"Of {len(states):,} pairs of photos: " + ", ".join(f"{count:,} {state}" for state, count in counts) + "."
 

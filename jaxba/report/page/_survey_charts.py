@@ -30,13 +30,14 @@ _ROLES = (("control", BLUE, "triangle-up"), ("check", ORANGE, "circle"))
 def positions_chart(report: dict[str, Any]) -> Figure | None:
     """Return the differences from the GNSS positions along each axis, in the order of the photos."""
     rows = [(k, photo) for k, photo in enumerate(report["photos"], 1) if photo["residual_m"] is not None]
-    rows = [(k, photo) for k, photo in rows if photo["position"] in ("used", "gated")]
+    rows = [(k, photo) for k, photo in rows if photo["position"] in ("used", "let go", "left out")]
     if not rows:
         return None
     data = []
     for kind, name, marker in (
         ("used", "position used", {"size": 5, "color": BLUE}),
-        ("gated", "position set aside", {"size": 9, "color": ORANGE, "symbol": "diamond-open", "line": {"width": 2}}),
+        ("let go", "position let go", {"size": 9, "color": ORANGE, "symbol": "square-open", "line": {"width": 2}}),
+        ("left out", "position left out", {"size": 9, "color": ORANGE, "symbol": "diamond-open", "line": {"width": 2}}),
     ):
         chosen = [(k, photo) for k, photo in rows if photo["position"] == kind]
         for number, letter in enumerate(AXES if chosen else (), 1):
@@ -59,7 +60,8 @@ def positions_chart(report: dict[str, Any]) -> Figure | None:
         name="positions", title="Differences from the GNSS positions, photo by photo", height_px=460, data=data,
         layout=layout,
         caption="Adjusted position minus GNSS position of each photo. The axes show the range of the positions that "
-        "were used; positions that were set aside may lie outside, and the table of photos tells their differences.",
+        "were used; positions that were let go of or left out may lie outside, and the table of photos has "
+        "their differences.",
     )  # fmt: skip
 
 

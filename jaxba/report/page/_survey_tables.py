@@ -3,42 +3,66 @@
 from typing import Any
 
 from jaxba.report.page._drawing import short_unit
+from jaxba.report.page._photo_tables import sigma_of
 from jaxba.report.page._tables import AXIS_NAMES, Column, Table, along, number, state, table, text
+
+
+def sigma_blocks(found: dict[str, Any]) -> list[Table | str]:
+    """Return what the sigmas of cameras and points are of, their medians, and the absolute accuracy."""
+    rows = [
+        [f"{sigma_of(found)} of a {what}, median", *found[key]]
+        for what, key in (("camera", "camera_m"), ("point", "point_m"))
+    ]
+    rows.append(["absolute accuracy of a point", *(found["absolute_m"] or ["not known"] * 3)])
+    told = f"Absolute accuracy: {found['absolute_text'][0].lower()}{found['absolute_text'][1:]}"
+    return [found["text"], table("Sigmas and absolute accuracy", [text("figure"), *along("")], rows, note=told)]
 
 
 def position_tables(found: dict[str, Any]) -> list[Table]:
     """Return the differences from the GNSS positions along each axis, and the offset of each flight."""
     keys = {
-        "mean_m": "mean, adjusted - GNSS", "rms_m": "RMS, adjusted - GNSS", "stated_m": "sigma as stated",
-        "taken_m": "sigma as used", "common_m": "common, GNSS - adjusted", "common_std_m": "its sigma",
+        "mean_m": "mean", "rms_m": "RMS", "stated_m": "sigma as stated", "taken_m": "sigma as used",
+        "common_m": "offset in common", "common_std_m": "its sigma",
     }  # fmt: skip
-    known = {name: found[key] for key, name in keys.items() if found[key] is not None}
+    known = {name: found[key] or ["not determined"] * 3 for key, name in keys.items()}
+    for name in ("offset in common", "its sigma"):
+        known[name] = ["not determined" if value is None else value for value in known[name]]
+    apart = [
+        f"{count:,} {what}"
+        for count, what in (
+            (found["num_let_go"], "that contradict the block were let go of"),
+            (found["num_left_out"], "took no part"),
+        )
+        if count
+    ]
     tables = [
         table(
-            f"{found['num']:,} GNSS positions", [text("axis"), *(Column(name=name, unit="m") for name in known)],
+            f"{found['num']:,} GNSS positions, adjusted minus measured",
+            [text("axis"), *(Column(name=name, unit="m") for name in known)],
             [[axis, *(values[k] for values in known.values())] for k, axis in enumerate(AXIS_NAMES)],
+            note="The sigma as stated is that of photos, lists or parameters; the sigma as used is what the adjustment "
+            f"weighed positions with.{' Beside these, ' + ', and '.join(apart) + '.' if apart else ''}",
         )
-    ]  # fmt: skip
+    ]
     if found["flights"]:
         rows = [[row["number"], row["num_photos"], *row["offset_m"], *row["std_m"]] for row in found["flights"]]
-        columns = [Column(name="flight"), Column(name="photos"), *along("offset"), *along("sigma")]
-        tables.append(
-            table(
-                "Offset of each flight",
-                columns,
-                rows,
-                note="What the GNSS positions of a flight have in common: GNSS minus adjusted.",
-            )
-        )
+        columns = [Column(name="flight"), Column(name="photos"), *along("offset in common"), *along("sigma")]
+        note = "What the GNSS positions of a flight have in common: adjusted minus measured."
+        tables.append(table("Offset of each flight", columns, rows, note=note))
     return tables
 
 
 def attitude_table(found: dict[str, Any]) -> Table:
     """Return the differences from the recorded attitudes."""
-    figures = ("mean, adjusted - recorded", "RMS, adjusted - recorded")
-    columns = [text("angle"), *(Column(name=name, unit="°") for name in figures)]
-    rows = zip(found["names"], found["mean_deg"], found["rms_deg"], strict=True)
-    return table(f"{found['num']:,} attitudes", columns, rows, digits=2)
+    columns = [text("angle"), *(Column(name=name, unit="°") for name in ("mean direction", "circular spread"))]
+    rows = zip(found["names"], found["mean_deg"], found["spread_deg"], strict=True)
+    bad = found["contradict"]
+    told = f" {len(bad):,} of them contradict the block, which the findings name." if bad else ""
+    return table(
+        f"{found['num']:,} attitudes, adjusted minus measured", columns, rows, digits=2,
+        note="Attitudes take part as weak measurements: those of a flight err alike, so that all together count as "
+        f"one, and those that contradict the block hardly count.{told}",
+    )  # fmt: skip
 
 
 def control_tables(report: dict[str, Any]) -> list[Table]:
@@ -53,8 +77,8 @@ def control_tables(report: dict[str, Any]) -> list[Table]:
         for point in points
     ]  # fmt: skip
     reliability = [
-        [point["name"], point["role"], *point["without_m"], *map(_detectable, point["detectable_m"]),
-         *map(_detectable, point["reach_m"])]
+        [point["name"], point["role"], *(number(value, 2) for value in point["redundancy"]), *point["without_m"],
+         *map(_detectable, point["detectable_m"]), *map(_detectable, point["reach_m"])]
         for point in points
         if point["role"] == "control"
     ]  # fmt: skip
@@ -65,20 +89,21 @@ def control_tables(report: dict[str, Any]) -> list[Table]:
         table(
             "Differences at each point",
             [*role, Column(name="marks"), Column(name="marks used"), Column(name="RMS of marks", unit="px"),
-             *along("adj. - surveyed"), *along("sigma adj."), *along("sigma survey"),
+             *along("adjusted - surveyed"), *along("sigma adjusted"),
+             *along("sigma of survey"),
              Column(name="off by", unit="sigmas"), text("remark")],
             differences, is_wide=True, digits=3,
             note="Adjusted minus surveyed place. A point that is off by more than 3 sigmas deserves a look at its "
             "marks and at its survey.",
         ),
         table(
-            "Reliability: what would be noticed at each point",
-            [*role, *along("without it"), *along("noticed from"), *along("reaches")],
+            "Reliability of control points",
+            [*role, *along("redundancy number", ""), *along("residual without the point"),
+             *along("internal reliability"), *along("external reliability")],
             reliability, is_wide=True,
-            note="Without it: how far the point would be off had it taken no part. Noticed from: the smallest error "
-            "of its survey that the other observations would show; smaller ones stay hidden. Reaches: how far a "
-            "hidden error moves results. “Unchecked” means that nothing else checks the point, so that any error "
-            "stays hidden.",
+            note="Redundancy number: the share of an error of the survey that shows, 0 to 1. Internal reliability: the "
+            "minimal detectable error; smaller ones stay hidden. External reliability: how far an error of that size "
+            "moves the point. “Unchecked” means that nothing else checks the point, so that any error stays hidden.",
         ),
         table(
             "Coordinates of each point",
@@ -102,23 +127,31 @@ def bar_table(found: dict[str, Any]) -> Table:
 
 
 def statistics_table(found: dict[str, Any]) -> Table:
-    """Return the kinds of observations with the sigmas that the block itself gives them."""
+    """Return the kinds of measurements with the sigmas that the block itself gives them."""
     columns = [
-        text("measurements"), Column(name="coordinates"), Column(name="redundancy"), text("unit"),
-        Column(name="sigma as stated"),
-        Column(name="sigma found"), Column(name="its own sigma", unit="%"), text("reliable"),
+        text("measurements"), Column(name="components"), Column(name="redundancy"), text("unit"),
+        Column(name="sigma as stated"), Column(name="sigma as used"), Column(name="sigma found"),
+        Column(name="its own sigma", unit="%"), text("reliable"),
     ]  # fmt: skip
     rows = [
-        [kind["name"], kind["count"], number(kind["redundancy"], 1), kind["unit"], kind["taken_std"], kind["std"],
-         _percent(kind["std_share"]), "yes" if kind["is_known"] else "no, too few"]
+        [kind["name"], kind["count"], number(kind["redundancy"], 1), kind["unit"], kind["taken_std"],
+         kind["weighed_std"], kind["std"], _percent(kind["std_share"]), _reliable(kind["is_known"])]
         for kind in found["kinds"]
     ]  # fmt: skip
     return table(
         "Sigmas of the measurements",
         columns,
         rows,
-        note="The sigma that was found is reliable where the redundancy is large enough.",
+        note="Nothing states the sigma of tie points: the one that was used is estimated from their errors. Assumed "
+        "beforehand are weak values of the cameras' intrinsics and of offsets in common, which count as measurements "
+        "do, so that all rows sum up to the redundancy. Attitudes of a flight err alike, so that the sigma as used is "
+        "that of one times the root of their number. The sigma that was found is reliable where the redundancy is "
+        "large enough.",
     )
+
+
+def _reliable(is_known: bool | None) -> str:
+    return "" if is_known is None else "yes" if is_known else "no, too few"
 
 
 def accuracy_table(found: dict[str, Any]) -> Table:

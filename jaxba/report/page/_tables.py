@@ -11,7 +11,7 @@ AXIS_NAMES = ("east", "north", "up")
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A column: its heading, its unit, and whether it holds text or states rather than numbers."""
+    """A column: its heading, its unit, and whether it holds text, states or hashes rather than numbers."""
 
     name: str
     unit: str = ""

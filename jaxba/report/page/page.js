@@ -1,10 +1,11 @@
 "use strict";
 // Draws the figures, follows light, dark and paper, and lets tables be sorted. What can be asked from outside:
-// `reportDrawn` is true once every figure has been drawn; `drawAll()` draws what is left and promises to be done.
+// `reportDrawn` is true once every figure has been drawn, but for what waits until it is looked at; `drawAll()` draws
+// what is left and promises to be done.
 (() => {
   const root = document.documentElement;
   const PRINT_WIDTH = 680; // of A4 within its margins, in pixels of CSS
-  const HIGHEST = 540, HIGHEST_ON_PAPER = 275; // of the room inside the axes; two figures go on a page
+  const HIGHEST = 540, HIGHEST_ON_PAPER = 620; // of the room inside the axes; a map is as wide as the page
   const COLOURS = ["ink", "muted", "grid", "paper", "blue", "step-1", "step-2", "step-3", "step-4"];
   // named one by one, since Plotly's own choice has a button that sends the figure to a server
   const BUTTONS = ["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"];
@@ -38,8 +39,17 @@
     if (Array.isArray(value)) {
       return typeof value[0] === "object" && value[0] !== null ? value.map((one) => coloured(one, key, colours)) : value;
     }
-    if (value === null || typeof value !== "object") return value;
+    if (value === null || typeof value !== "object" || ArrayBuffer.isView(value)) return value;
     return Object.fromEntries(Object.entries(value).map(([name, one]) => [name, coloured(one, name, colours)]));
+  }
+
+  // whether WebGL has no graphics card, and computes each pixel
+  function isSoftware() {
+    const gl = document.createElement("canvas").getContext("webgl");
+    const info = gl?.getExtension("WEBGL_debug_renderer_info");
+    const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+    gl?.getExtension("WEBGL_lose_context")?.loseContext();
+    return /swiftshader|llvmpipe|software|basic render/i.test(name);
   }
 
   // data and layout for the width that there is now
@@ -65,7 +75,7 @@
     const legend = entries.length < 2 ? 0 : 12 + 20 * Math.ceil(length / (figure.width - beside));
     if (made.scene) {
       made.height = isPrinting ? 380 : Math.min(height, Math.round(figure.width * 0.9));
-      if (isNarrow || isPrinting) for (const axis of "xyz") made.scene.camera.eye[axis] *= 1.2;
+      if (isNarrow || isPrinting) for (const axis of "xyz") made.scene.camera.eye[axis] *= isPrinting ? 1.35 : 1.2;
     } else if (height) {
       made.height = Math.round(height * (isPrinting ? 0.85 : 1)) + (isNarrow ? legend : 0);
     } else {
@@ -82,14 +92,35 @@
     return [traces, made];
   }
 
+  // lines between places: the page has their numbers alone, since a block of 500 photos has 10,000 pairs
+  const TYPES = { f8: Float64Array, u4: Uint32Array, u2: Uint16Array };
+  function unpacked({ dtype, bdata }) {
+    return new TYPES[dtype](Uint8Array.from(atob(bdata), (letter) => letter.charCodeAt(0)).buffer);
+  }
+  function joinPlaces({ data, places }) {
+    if (!places) return;
+    const xy = unpacked(places);
+    for (const trace of data) {
+      if (!trace.ends) continue;
+      const ends = unpacked(trace.ends);
+      delete trace.ends;
+      for (const [axis, letter] of ["x", "y"].entries()) {
+        trace[letter] = new Float64Array(1.5 * ends.length).fill(NaN); // a gap after each line
+        for (let k = 0; k < ends.length; k += 1) trace[letter][k + (k >> 1)] = xy[2 * ends[k] + axis];
+      }
+    }
+  }
+
   function draw(figure) {
     figure.drawn ??= (async () => {
       try {
         figure.parts = JSON.parse(figure.text);
+        joinPlaces(figure.parts);
         const [traces, layout] = prepared(figure);
         await Plotly.newPlot(figure.plot, traces, layout, {
           displaylogo: false, responsive: false, displayModeBar: touch.matches ? false : "hover",
           modeBarButtons: [layout.scene ? BUTTONS_IN_SPACE : BUTTONS], plotlyServerURL: "",
+          plotGlPixelRatio: layout.scene && isSoftware() ? 1 : 2,
           toImageButtonOptions: { filename: figure.element.id.slice(2), scale: 2 },
         });
       } catch (error) {
@@ -102,25 +133,24 @@
   const redraw = (figure) => figure.parts && Plotly.react(figure.plot, ...prepared(figure));
   const redrawAll = () => figures.forEach(redraw);
 
-  window.drawAll = async () => {
-    await Promise.all(figures.map(draw));
-    window.reportDrawn = true;
-    root.dataset.drawn = "true";
-  };
+  window.drawAll = () => Promise.all(figures.map(draw));
 
   // figures near the window first, then the others one by one while the reader reads
   const near = new IntersectionObserver((entries) => {
     for (const entry of entries) if (entry.isIntersecting) draw(figures.find((figure) => figure.plot === entry.target));
   }, { rootMargin: "600px" });
   figures.forEach((figure) => near.observe(figure.plot));
-  const pause = () => new Promise((resolve) => setTimeout(resolve, 20));
+  const pause = () => new Promise((resolve) => setTimeout(resolve, 5));
   addEventListener("load", async () => {
     await pause();
     for (const figure of figures) {
+      // the points in space take some 3 s without a graphics card, and nothing else moves meanwhile
+      if (figure.element.id === "f-space" && isSoftware()) continue;
       await draw(figure);
       await pause();
     }
-    await window.drawAll();
+    window.reportDrawn = true;
+    root.dataset.drawn = "true";
   });
 
   let resizing = 0;

@@ -26,7 +26,7 @@ _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 _BENCHMARK = re.compile(r"python -m (benchmarks\.\w+)")
-_SUFFIXES = ("py", "csv", "md")  # `export.py` is no parameter
+_SUFFIXES = ("py", "csv", "md", "toml")  # `export.py` is no parameter
 
 
 def anchors(path: Path) -> set[str]:

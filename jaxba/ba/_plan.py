@@ -28,7 +28,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxba._errors import JaxbaError
-from jaxba.ba._plan_shape import PlanShape, bare_shape, bucket
+from jaxba.ba._plan_shape import SMALL_IMAGES, PlanShape, bare_shape, bucket
 from jaxba.ba._problem import Problem
 from jaxba.ba._projection import camera_centers
 from jaxba.geometry import require_number
@@ -107,7 +107,7 @@ def make_plan(
     solver, panel_images, band_panels = _choose_linear_solver(linear_solver, len(image_order), block, bandwidth)
     if like is not None and like.block == block and band_panels <= like.band_panels:
         solver, panel_images, band_panels = like.linear_solver, like.panel_images, like.band_panels
-    num_images = max(bucket(problem.num_images + 1, multiple=panel_images), least.num_images)
+    num_images = max(bucket(problem.num_images + 1, multiple=panel_images, small=SMALL_IMAGES), least.num_images)
     num_images = -(-num_images // panel_images) * panel_images
 
     rank_of_image = np.empty(problem.num_images, np.int32)

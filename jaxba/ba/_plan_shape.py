@@ -1,6 +1,7 @@
 """Shapes of plans: sizes and choices that the compiled code depends on, and how several problems come to share them.
 
-Compiling costs seconds, so every count is rounded up to one of eight sizes an octave.
+Compiling costs seconds, so every count is rounded up to one of eight sizes an octave. Small counts, whose padding costs no
+more than a millisecond or two, are rounded up to one of two, and tiny ones to one size for all.
 """
 
 import dataclasses
@@ -61,19 +62,21 @@ class PlanShape:
         return self.num_shared_cameras * self.num_refined + self.antenna
 
 
-_NOTHING = PlanShape(
-    num_images=0, num_points=0, num_rows=0, chunk_runs=0, num_cameras=0, refined=(), own_cameras=False, antenna=0,
-    any_fixed_pose=False, any_fixed_point=False, any_bound=False, num_pair_runs=0, num_blocks=0, linear_solver="dense",
-    panel_images=1, band_panels=0, prior_rows=(),
+_SMALL, SMALL_IMAGES = 2048, 64  # below, two sizes an octave
+_LEAST_PRIOR_ROWS = 16
+_LEAST = PlanShape(
+    num_images=16, num_points=256, num_rows=1024, chunk_runs=0, num_cameras=0, refined=(), own_cameras=False, antenna=0,
+    any_fixed_pose=False, any_fixed_point=False, any_bound=False, num_pair_runs=512, num_blocks=64,
+    linear_solver="dense", panel_images=1, band_panels=0, prior_rows=(),
 )  # fmt: skip
 
 
 def bare_shape(problem: Problem, like: PlanShape | None = None) -> PlanShape:
-    """Return the shape that says what is free and nothing of sizes, or those of `like`."""
-    least = _NOTHING if like is None else like
+    """Return the shape that says what is free and has the least sizes, or those of `like`."""
+    least = _LEAST if like is None else like
     free, free_antenna = problem.free, problem.free_antenna
     refined = np.atleast_1d(np.asarray(free.intrinsics).any(axis=0))
-    rows = [bucket(num_rows(prior)) for prior in problem.priors]
+    rows = [max(bucket(num_rows(prior)), _LEAST_PRIOR_ROWS) for prior in problem.priors]
     if len(rows) == len(least.prior_rows):
         rows = [max(own, of_like) for own, of_like in zip(rows, least.prior_rows, strict=True)]
     several = problem.num_cameras > 1 or least.own_cameras
@@ -117,9 +120,9 @@ def num_rows(prior: AbstractPrior) -> int:
     return next(np.shape(value)[0] for name, value in vars(prior).items() if name != "loss")
 
 
-def bucket(count: int, *, multiple: int = 1) -> int:
-    """Round up to one of eight sizes an octave (at most 12.5% more), and to a multiple."""
-    step = max(1 << max(count.bit_length() - 4, 0), 1)
+def bucket(count: int, *, multiple: int = 1, small: int = _SMALL) -> int:
+    """Round up to one of eight sizes an octave (at most 12.5% more), below `small` to one of two, and to a multiple."""
+    step = 1 << max(count.bit_length() - (2 if count < small else 4), 0)
     rounded = -(-count // step) * step
     return -(-rounded // multiple) * multiple
 

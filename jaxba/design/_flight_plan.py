@@ -95,6 +95,12 @@ def _plan_of(tables: dict[str, Any]) -> FlightPlan:
     polygon = _pairs("area.polygon", area["polygon"], least=3)
     place, area_m = Place.of(polygon, crs)
     _refuse_polygon(area_m)
+    height, relief = known["flight"].height_m, known["ground"].relief_m
+    if relief > height:
+        raise JaxbaError(
+            f"ground.relief_m={relief:g} is over flight.height_m={height:g}, which counts from the mean ground: hills "
+            "would reach the photos. Fly higher, or plan a part of the area with less relief."
+        )
     control_m = place.local(_pairs("control.points", points, least=0))
     return FlightPlan(area_m=area_m, place=place, control_m=control_m, **known)
 

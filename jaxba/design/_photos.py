@@ -133,16 +133,19 @@ def _observed(
     images = Images(
         photos.center_m, photos.cam_from_world, photos.cameras, photos.camera_index, photos.frame_px, 0.0, photos.view
     )
-    tracks = make_tracks(
-        rng,
-        images,
-        terrain,
-        reach_m=np.full(2, reach),
-        beyond_m=nadir,
-        num_tie=round(ties.points_per_image * photos.num),
-        mean_length=ties.mean_track_length,
-        num_marks=0,
-    )
+    try:
+        tracks = make_tracks(
+            rng,
+            images,
+            terrain,
+            reach_m=np.full(2, reach),
+            beyond_m=nadir,
+            num_tie=round(ties.points_per_image * photos.num),
+            mean_length=ties.mean_track_length,
+            num_marks=0,
+        )
+    except JaxbaError as error:
+        raise JaxbaError(f"the photos would not make a block: {error}") from None
     image, target, marked = marks(photos, targets.xyz_m)
     seen = np.bincount(target, minlength=len(targets.xyz_m))
     if (seen < 2).any():

@@ -11,6 +11,7 @@ of a mean of a high power of the sigmas. The descent begins at the best places o
 other and exchanged until none helps, and at places spread evenly.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -70,7 +71,8 @@ class _Reached(NamedTuple):
     worst_m: float
 
 
-def place_control(network: Network, count: int, std_m: Sequence[float]) -> Placed:
+@functools.lru_cache(maxsize=4)
+def place_control(network: Network, count: int, std_m: tuple[float, float, float]) -> Placed:
     """Return where `count` more control points lower the largest sigma over the area most.
 
     - `std_m`: sigma of their surveyed coordinates, east, north, up.

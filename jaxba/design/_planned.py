@@ -42,8 +42,7 @@ def photos_of(plan: FlightPlan, stations: Stations) -> tuple[Photos, Ground]:
         np.zeros(len(rotation), np.int32),
         (camera.width_px, camera.height_px),
     )
-    relief = min(plan.ground.relief_m, plan.flight.height_m)
-    terrain = smooth_terrain(terrain_rng, relief, plan.flight.height_m)
+    terrain = smooth_terrain(terrain_rng, plan.ground.relief_m, plan.flight.height_m)
     reach = 2 * plan.flight.height_m
     low, high = stations.center_m[:, :2].min(axis=0) - reach, stations.center_m[:, :2].max(axis=0) + reach
     return photos, ground_of_terrain(terrain, low, high)

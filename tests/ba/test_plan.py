@@ -106,15 +106,23 @@ def test_unknowns_come_back_as_they_went_in(name, linear_solver):
     jax.tree.map(np.testing.assert_array_equal, restore(unknowns, plan), start_of(problem))
 
 
-def test_bucket_adds_at_most_an_eighth_and_has_eight_sizes_an_octave():
-    counts = range(1, 5000)
+def test_bucket_adds_at_most_an_eighth_and_small_counts_have_two_sizes_an_octave():
+    counts = range(1, 9000)
     sizes = [bucket(count) for count in counts]
-    assert all(count <= size <= max(count * 1.125, count + 1) for count, size in zip(counts, sizes, strict=True))
+    most = [1.125 if count >= 2048 else 1.5 for count in counts]
+    assert all(n <= size <= max(n * m, n + 1) for n, size, m in zip(counts, sizes, most, strict=True))
     assert sizes == sorted(sizes)
-    assert len({size for size in sizes if 512 < size <= 1024}) == 8
+    assert len({size for size in sizes if 4096 < size <= 8192}) == 8
+    assert {size for size in sizes if 512 < size <= 1024} == {768, 1024}
     assert all(bucket(bucket(count)) == bucket(count) for count in counts)
     assert bucket(100, multiple=7) % 7 == 0
     assert bucket(100, multiple=7) >= 100
+
+
+def test_tiny_problems_share_one_shape() -> None:
+    """They would compile anew for each, which takes a thousand times as long as solving it."""
+    shapes = {make_plan(small_problem(RADIAL, num_points=count)).shape for count in (20, 30, 45)}
+    assert len(shapes) == 1
 
 
 def test_plans_of_a_series_share_one_shape() -> None:

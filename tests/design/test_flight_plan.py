@@ -71,6 +71,7 @@ TRIANGLE = "[area]\npolygon = [[0, 0], [9, 0], [9, 9]]\n"
         (TRIANGLE + "[flihgt]\nheight_m = 90\n", "no section 'flihgt'; did you mean flight"),
         (TRIANGLE + '[gnss]\nkind = "rtx"\n', "gnss.kind=rtx is out of range; allowed: rtk"),
         (TRIANGLE + "[control]\npoints = [5]\n", "control.points: entry 1 is 5"),
+        (TRIANGLE + "[ground]\nrelief_m = 120\n", "ground.relief_m=120 is over flight.height_m=100"),
         ("[area\n", "is not valid TOML"),
     ],
 )  # fmt: skip

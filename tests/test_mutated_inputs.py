@@ -22,9 +22,11 @@ from jaxba.io import (
     parse_control,
     parse_geotags,
     read_bal,
+    read_colmap_binary,
     read_colmap_text,
     read_problem,
     read_tile,
+    write_colmap_binary,
     write_csv_cloud,
     write_ply,
     write_tile,
@@ -145,6 +147,21 @@ def colmap(rng: np.random.Generator, folder: Path) -> None:
     read_colmap_text(folder)
 
 
+def colmap_binary(rng: np.random.Generator, folder: Path) -> None:
+    for name in ("rigs", "frames"):
+        (folder / f"{name}.txt").unlink(missing_ok=True)
+    for name in ("cameras", "images", "points3D"):
+        written(folder / f"{name}.txt", COLMAP[name])
+    model = read_colmap_text(folder)
+    write_colmap_binary(folder, model.block, model.names, model.size_px, model.error_px)
+    chosen = folder / f"{('cameras', 'images', 'points3D')[rng.integers(3)]}.bin"
+    data = bytearray(chosen.read_bytes())
+    for _ in range(rng.integers(1, 4)):
+        data[rng.integers(len(data))] = rng.integers(256)
+    written(chosen, bytes(data[: rng.integers(len(data))] if rng.random() < 0.3 else data))
+    read_colmap_binary(folder)
+
+
 def control(rng: np.random.Generator, folder: Path) -> None:
     given = Given(photos=folder, gcp=written(folder / "gcp.txt", damaged(rng, GCP[rng.integers(len(GCP))])))
     parse_control(read_lists(given)["gcp"][1], is_photo="b (2).jpg".__eq__)
@@ -179,7 +196,9 @@ def written(path: Path, data: bytes) -> Path:
     return path
 
 
-READERS: list[Callable[[np.random.Generator, Path], None]] = [tile, noise, bal, colmap, control, geotags, toml, cloud]
+READERS: list[Callable[[np.random.Generator, Path], None]] = [
+    tile, noise, bal, colmap, colmap_binary, control, geotags, toml, cloud,
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("read", READERS, ids=lambda read: read.__name__)

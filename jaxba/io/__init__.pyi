@@ -50,6 +50,8 @@ from ._problem import problem_of_bytes as problem_of_bytes, read_problem as read
 from ._read import read_bytes as read_bytes, text_of as text_of
 from ._read_colmap import read_colmap as read_colmap, read_colmap_text as read_colmap_text
 from ._read_colmap_binary import read_colmap_binary as read_colmap_binary
+from ._read_opensfm import read_opensfm as read_opensfm
+from ._reconstruction import read_reconstruction as read_reconstruction
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
 from ._sites import (
     SITE_COLUMNS as SITE_COLUMNS,

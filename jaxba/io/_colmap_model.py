@@ -32,7 +32,7 @@ class ColmapModel:
     - `names`: of the images. `size_px`: width and height of each camera's. `error_px`: of each point as the file has
       it, negative where it was not computed. `block.image_index` is IMAGE_ID - 1, `block.camera_names` the CAMERA_IDs;
       the world is any frame and scale.
-    - `point_ids`: POINT3D_IDs. `claims`: what the files' headers say of the model.
+    - `point_ids`: POINT3D_IDs. `claims`: what the files' headers say of the model. `files`: the three.
     """
 
     block: Block
@@ -40,6 +40,7 @@ class ColmapModel:
     size_px: Int[np.ndarray, "cameras 2"]
     error_px: Float[np.ndarray, " points"]
     point_ids: tuple[int, ...]
+    files: tuple[Path, ...]
     claims: tuple[Claim, ...] = ()
 
 
@@ -168,6 +169,7 @@ def model_of(
         size_px=size_px,
         error_px=np.array([point.error_px for point in points]),
         point_ids=tuple(point.point_id for point in points),
+        files=(files.cameras, files.images, files.points),
         claims=tuple(claims),
     )
 

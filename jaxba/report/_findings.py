@@ -9,13 +9,14 @@ import math
 from collections.abc import Callable, Sequence
 
 from jaxba.engine._words import many
+from jaxba.report._audit_findings import AUDIT_WORDS
 from jaxba.report._bars import BAR_WORDS
 from jaxba.report._control_findings import CONTROL_WORDS, along_axes
 from jaxba.scene import Finding
 
 _MOST_NAMES = 10
 _MOST_ROWS = 8
-_TO_KNOW = ("edges left out", "common offset", "scale by bars")
+_TO_KNOW = ("edges left out", "common offset", "scale by bars", "audit note")
 _LOOKS = {
     "down from one height": " (all photos look straight down from one height)",
     "down": " (photos look straight down)",
@@ -229,6 +230,7 @@ WORDS: dict[str, Callable[..., str]] = {
     "principal point off": _principal_point_off,
     "weak positions": _weak_positions,
     "common offset": _common_offset,
+    **AUDIT_WORDS,
     **BAR_WORDS,
     **CONTROL_WORDS,
 }

@@ -18,12 +18,15 @@ def run(model: Path, *, out: Path, gcp: Path | None, crs: str | None, as_json: b
     found = audit(model, out, gcp=gcp, crs=crs)
     code = 1 if found.faults else 0
     if as_json:
-        sections = {name: found.facts[name] for name in ("verdict", "audit", "quality", "summary", "findings")}
+        sections = {
+            name: found.facts[name] for name in ("verdict", "audit", "control", "quality", "summary", "findings")
+        }
         print(to_json({**sections, "report": str(found.page), "exit_code": code}))
         return code
     others = [finding for finding in found.findings if finding not in found.faults]
     for label, text in [
         *_model_rows(found.facts),
+        *_control_rows(found.facts["control"]),
         *labelled("faults", sentences(found.faults)),
         *labelled("findings", sentences(others)),
         ("report", str(found.page)),
@@ -31,6 +34,14 @@ def run(model: Path, *, out: Path, gcp: Path | None, crs: str | None, as_json: b
         print(wrapped(label, text, _LABEL))
     print(many(len(found.faults), "fault") if code else "no fault was found")
     return code
+
+
+def _control_rows(control: dict[str, Any]) -> list[tuple[str, str]]:
+    if "none" in control:
+        return []
+    known = [f"{rms:.3f}" for rms in control["control_rms_m"] if rms is not None]
+    rms = f", RMS {', '.join(known)} m east, north, up" if known else ""
+    return [("control", f"{many(control['num_control'], 'control point')}, {control['num_check']} check points{rms}")]
 
 
 def _model_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:

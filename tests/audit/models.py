@@ -66,3 +66,26 @@ PLANTS: dict[str, Callable[[pycolmap.Reconstruction], object]] = {
     "camera": with_camera_shifted,
     "matches": with_wrong_matches,
 }
+
+
+def control_list(
+    model: pycolmap.Reconstruction, *, exchanged: tuple[str, str] = ("", ""), crs: str = "EPSG:32615\n"
+) -> str:
+    """Return a gcp_list.txt of eight points in the cloud, 10 m a unit of the model, which is turned in space.
+
+    - `exchanged`: two points that have each other's coordinates. `crs`: its first line.
+    """
+    rng = np.random.default_rng(5)
+    turn = pycolmap.Rotation3d(np.array([0.3, -0.5, 0.2])).matrix()
+    points = [model.points3D[k].xyz for k in sorted(model.points3D)[:8]]
+    surveyed = {f"g{k}": 10.0 * turn @ point + [576300.0, 5183400.0, 300.0] for k, point in enumerate(points)}
+    surveyed = {name: xyz + rng.normal(0, [0.02, 0.02, 0.03]) for name, xyz in surveyed.items()}
+    rows = []
+    for name, point in zip(list(surveyed), points, strict=True):
+        for _, image in sorted(model.images.items())[:6]:
+            seen = image.project_point(point)
+            if seen is not None and np.all((seen > 0) & (seen < SIZE_PX)):
+                x, y = seen + rng.normal(0, 0.3, 2)
+                other = dict([exchanged, exchanged[::-1]]).get(name, name)
+                rows.append("{:.4f} {:.4f} {:.4f} ".format(*surveyed[other]) + f"{x:.3f} {y:.3f} {image.name} {name}")
+    return crs + "\n".join(rows) + "\n"

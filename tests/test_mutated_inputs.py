@@ -25,6 +25,7 @@ from jaxba.io import (
     read_colmap_binary,
     read_colmap_text,
     read_problem,
+    read_reconstruction,
     read_tile,
     write_colmap_binary,
     write_csv_cloud,
@@ -50,6 +51,12 @@ COLMAP = {
     "rigs": b"1 2 CAMERA 1 CAMERA 2 1 0.6 0 0 0.8 -1 0 5\n",
     "frames": b"1 1 1 0 0 0 0 0 5 2 CAMERA 1 1 CAMERA 2 2\n",
 }
+OPENSFM = (
+    b'[{"cameras": {"c": {"projection_type": "brown", "width": 100, "height": 80, "focal_x": 0.9, "focal_y": 0.9}},'
+    b'"shots": {"a.jpg": {"rotation": [0, 0, 0], "translation": [0, 0, 5], "camera": "c"}},'
+    b'"points": {"7": {"color": [1, 2, 3], "coordinates": [1, 2, 3]}}}]'
+)
+TRACKS = b"OPENSFM_TRACKS_VERSION_v2\na.jpg\t7\t1\t0.1\t0.2\t0.01\t1\t2\t3\t-1\t-1\n"
 GCP = (
     b"EPSG:32615\n576308.6 5183424.7 198.2 12 9 a.jpg g1\n576308.6 5183424.7 198.2 3 9 b (2).jpg g1 x\n",
     b"# EPSG:32615\nname,x,y,z,px,py,image,std_h,std_v,role\ng1,576308.6,5183424.7,,12,9,a.jpg,0.01,0.02,check\n",
@@ -162,6 +169,12 @@ def colmap_binary(rng: np.random.Generator, folder: Path) -> None:
     read_colmap_binary(folder)
 
 
+def opensfm(rng: np.random.Generator, folder: Path) -> None:
+    written(folder / "reconstruction.json", damaged(rng, OPENSFM) if rng.random() < 0.7 else OPENSFM)
+    written(folder / "tracks.csv", damaged(rng, TRACKS))
+    read_reconstruction(folder / "reconstruction.json")
+
+
 def control(rng: np.random.Generator, folder: Path) -> None:
     given = Given(photos=folder, gcp=written(folder / "gcp.txt", damaged(rng, GCP[rng.integers(len(GCP))])))
     parse_control(read_lists(given)["gcp"][1], is_photo="b (2).jpg".__eq__)
@@ -197,7 +210,7 @@ def written(path: Path, data: bytes) -> Path:
 
 
 READERS: list[Callable[[np.random.Generator, Path], None]] = [
-    tile, noise, bal, colmap, colmap_binary, control, geotags, toml, cloud,
+    tile, noise, bal, colmap, colmap_binary, opensfm, control, geotags, toml, cloud,
 ]  # fmt: skip
 
 

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jaxba._atomic import cannot_write
+from jaxba._errors import JaxbaError
 from jaxba.audit._claims import check_claims
 from jaxba.audit._faults import findings, is_fault
 from jaxba.audit._moved import moved_images, moved_intrinsics
@@ -45,6 +47,8 @@ def audit(model: Path, out: Path, *, gcp: Path | None = None, crs: str | None = 
         JaxbaError: the model or the list cannot be read or contradict themselves, too little of the model can be
             adjusted, or a file cannot be written.
     """
+    if out.exists() and not out.is_dir():
+        raise JaxbaError(f"{out}: is a file, where the folder of the report is to be; name another as --out.")
     given = read_reconstruction(model)
     control = read_list(gcp, "a gcp_list.txt or CSV")
     claims = check_claims(given)
@@ -54,5 +58,8 @@ def audit(model: Path, out: Path, *, gcp: Path | None = None, crs: str | None = 
     every = findings(given, claims, found, images, intrinsics, settings.min_angle)
     of_audit = section(model, given, claims, found, images, intrinsics, every, settings.min_angle)
     facts = report_facts(out, model, given, found, every, of_audit)
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(out, error) from error
     return Audited(facts=facts, findings=every, page=write_facts(out, facts))

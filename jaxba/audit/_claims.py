@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from jaxba._errors import JaxbaError
 from jaxba.scene import Block, Reconstruction
 
 LEAST_PX = 0.01
@@ -92,8 +93,16 @@ def residuals_px(block: Block) -> Float[np.ndarray, "observations 2"]:
 
 
 def check_claims(given: Reconstruction) -> Claims:
-    """Return the figures of a model beside what its files say of them."""
+    """Return the figures of a model beside what its files say of them.
+
+    Raises `JaxbaError` where it has no observation.
+    """
     block = given.block
+    if not block.num_observations:
+        raise JaxbaError(
+            f"{given.files[0]}: none of its {block.num_points:,} points is observed in its images; give the whole "
+            "model, with keypoints and tracks."
+        )
     residual_px = residuals_px(block)
     error_px = np.hypot(*residual_px.T)
     error = error_px / given.unit_px[block.observation_image]

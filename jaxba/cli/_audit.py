@@ -1,8 +1,11 @@
 """`jaxba audit`: what is wrong with another program's result, by its own claims and its own measurements."""
 
+import contextlib
+import sys
 from pathlib import Path
 from typing import Any
 
+from jaxba.cli._run_progress import LiveLine, steps_told
 from jaxba.cli._text import labelled, many, to_json, wrapped
 from jaxba.engine._compile_cache import use_compilation_cache
 
@@ -15,7 +18,13 @@ def run(model: Path, *, out: Path, gcp: Path | None, crs: str | None, as_json: b
     from jaxba.audit import audit
     from jaxba.report import sentences
 
-    found = audit(model, out, gcp=gcp, crs=crs)
+    show = LiveLine() if sys.stderr.isatty() and not as_json else None
+    with contextlib.nullcontext() if show is None else steps_told(show.step):
+        try:
+            found = audit(model, out, gcp=gcp, crs=crs)
+        finally:
+            if show is not None:
+                show.clear()
     code = 1 if found.faults else 0
     if as_json:
         sections = {

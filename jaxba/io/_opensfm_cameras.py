@@ -19,6 +19,7 @@ from jaxba._errors import JaxbaError
 from jaxba.io._opensfm_fields import number, told
 
 _FISHEYE = "fisheye_opencv", "fisheye"
+_LONGEST_PX = 1e7
 _KINDS = "perspective", "brown", "radial", "simple_radial", *_FISHEYE
 
 
@@ -56,7 +57,7 @@ class OpensfmCameras:
         for name, camera in cameras.items():
             of = f"camera {name}"
             width, height = (number(file, of, camera, key) for key in ("width", "height"))
-            if not (width >= 1 and height >= 1):
+            if not (1 <= width < _LONGEST_PX and 1 <= height < _LONGEST_PX):
                 raise JaxbaError(f"{file}: {of} is {width:g} x {height:g} pixels; set width and height of its images.")
             rows.append(_parameters(file, of, camera, kinds[name], model, width, height))
             sizes.append([int(width), int(height)])

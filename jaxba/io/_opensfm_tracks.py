@@ -17,6 +17,7 @@ from jaxba._errors import JaxbaError
 from jaxba.io._read import read_bytes, text_of
 
 _HEADER = "OPENSFM_TRACKS_VERSION_v"
+_FARTHEST = 1e6  # longer sides from the middle: no pixel of an image
 _COLUMNS = {0: 8, 1: 9, 2: 11}  # by version
 
 
@@ -80,6 +81,6 @@ def _coordinate(path: Path, number: int, name: str, word: str) -> float:
         value = float(word)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise JaxbaError(f"{path}, line {number}: {name} is {word!r}, not a finite number; correct or delete the line.")
+    if not abs(value) < _FARTHEST:
+        raise JaxbaError(f"{path}, line {number}: {name} is {word!r}, no image coordinate; correct or delete the line.")
     return value

@@ -40,6 +40,10 @@ def test_a_clean_model_has_no_fault_and_a_whole_report(tmp_path: Path):
     assert paths_of(facts) - known == set()
     assert facts["verdict"]["state"] in ("good", "fair")
     assert facts["audit"]["fault_count"] == 0
+    assert facts["audit"]["held"] == ["cx", "cy"]  # in the middle of the image, as COLMAP leaves them
+    values = {part["name"]: part["value"] for part in facts["cameras"][0]["parameters"]}
+    assert (values["cx"], values["cy"]) == pytest.approx((512, 384), abs=1e-3)
+    assert values["f"] != facts["cameras"][0]["parameters"][0]["start"]
     assert all("none" in facts[section] for section in ("positions", "control", "bars", "accuracy"))
     assert json.loads((tmp_path / "audit" / "report.json").read_text()) == facts
     html = found.page.read_text()
@@ -153,6 +157,9 @@ def test_bad_input_ends_with_one_error_that_names_the_file(tmp_path: Path, cli: 
         assert (code, out) == (2, "")
         assert re.search(message, err) and err.count("\n") == 1, err
     path.write_bytes(whole)
+    (tmp_path / "file").touch()
+    code, _, err = cli("audit", tmp_path / "model", "--out", tmp_path / "file")
+    assert code == 2 and "file: is a file, where the folder of the report is to be" in err
     code, _, err = cli("audit", tmp_path / "model", "--gcp", tmp_path / "none.txt", "--out", tmp_path / "out")
     assert code == 2 and "none.txt: there is no such file" in err
     assert not (tmp_path / "out").exists()

@@ -184,7 +184,7 @@ def broken(**change: Any) -> dict[str, Any]:
          r"tracks\.csv: no row of point 7 in the shots of reconstruction\.json \(1 of 1 points have none\)"),
         (broken(), TRACKS.replace("_v2", "_v9"), r"tracks\.csv, line 1: tracks of version '9'; jaxba reads"),
         (broken(), TRACKS.replace("\t-1\t-1\n", "\n", 1), r"line 2: 9 fields, where version 2 of the tracks has 11"),
-        (broken(), TRACKS.replace("0.01", "nan", 1), r"tracks\.csv, line 3: x is 'nan', not a finite number"),
+        (broken(), TRACKS.replace("0.01", "nan", 1), r"tracks\.csv, line 3: x is 'nan', no image coordinate"),
         (broken(), TRACKS + TRACKS.splitlines()[1], r"tracks\.csv, line 14: track 0 has a b\.jpg in line 2 already"),
         ([], TRACKS, r"json: holds no list of reconstructions"),
     ],

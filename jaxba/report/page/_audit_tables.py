@@ -27,13 +27,11 @@ def _faults(found: dict[str, Any]) -> list[Table | str]:
 
 
 def _claims(found: dict[str, Any]) -> Table:
-    columns = [
-        text("figure"), text("unit"), text("stated"), text("computed"), text("difference"), text("so"),
-        text("definition"),
-    ]  # fmt: skip
+    columns = [text(name) for name in ("figure", "stated", "computed", "difference", "so", "definition")]
     rows = [
         [
-            row["name"], row["unit"], *(_digits(row[key]) for key in ("stated", "recomputed", "difference")),
+            f"{row['name']} ({row['unit']})" if row["unit"] else row["name"],
+            *(_digits(row[key]) for key in ("stated", "recomputed")), _difference(row),
             "" if row["stated"] is None else "no" if row["differs"] else "yes", row["definition"],
         ]
         for row in found["claims"]
@@ -49,6 +47,13 @@ def _digits(value: float | None) -> str:
     if value is None:
         return number(None)
     return f"{value:,.0f}" if float(value).is_integer() else f"{value:,.6g}"
+
+
+def _difference(row: dict[str, Any]) -> str:
+    """Return stated minus computed; none where it is rounding in float64."""
+    if row["difference"] is not None and abs(row["difference"]) <= 1e-12 * abs(row["recomputed"]):
+        return "0"
+    return _digits(None if row["difference"] is None else float(f"{row['difference']:.3g}"))
 
 
 def _of_the_rest(found: dict[str, Any]) -> str:

@@ -93,6 +93,11 @@ class ColmapFiles:
         cameras, images, points = (folder / f"{name}.{ending}" for name in ("cameras", "images", "points3D"))
         return ColmapFiles(cameras=cameras, images=images, points=points)
 
+    @property
+    def all(self) -> tuple[Path, Path, Path]:
+        """Return the three in the order of COLMAP's documentation."""
+        return self.cameras, self.images, self.points
+
 
 def check_camera(camera: ColmapCamera) -> None:
     """Raise `JaxbaError` for a camera of a model that jaxba has not, or with another number of parameters."""
@@ -169,7 +174,7 @@ def model_of(
         size_px=size_px,
         error_px=np.array([point.error_px for point in points]),
         point_ids=tuple(point.point_id for point in points),
-        files=(files.cameras, files.images, files.points),
+        files=files.all,
         claims=tuple(claims),
     )
 

@@ -40,7 +40,7 @@ def read_colmap(folder: str | os.PathLike[str]) -> ColmapModel:
     path = Path(folder)
     if not path.is_dir():
         raise JaxbaError(f"{path}: no such folder; give one with a COLMAP model.")
-    found = {kind: [of for of in _three(path, kind) if of.exists()] for kind in ("bin", "txt")}
+    found = {kind: [of for of in ColmapFiles.of(path, kind).all if of.exists()] for kind in ("bin", "txt")}
     for kind, read in (("bin", read_colmap_binary), ("txt", read_colmap_text)):
         if len(found[kind]) == 3:
             return read(path)
@@ -50,16 +50,11 @@ def read_colmap(folder: str | os.PathLike[str]) -> ColmapModel:
             f"{path}: holds no COLMAP model, neither cameras.bin, images.bin, points3D.bin nor the same as .txt; give "
             "the folder with these, such as sparse/0."
         )
-    missing = [of.name for of in _three(path, there[0].suffix[1:]) if not of.exists()]
+    missing = [of.name for of in ColmapFiles.of(path, there[0].suffix[1:]).all if not of.exists()]
     raise JaxbaError(
         f"{path / missing[0]}: no such file beside {there[0].name}; a model has cameras, images and points3D: export "
         "or copy it again."
     )
-
-
-def _three(folder: Path, ending: str) -> tuple[Path, Path, Path]:
-    files = ColmapFiles.of(folder, ending)
-    return files.cameras, files.images, files.points
 
 
 def read_colmap_text(folder: str | os.PathLike[str]) -> ColmapModel:

@@ -43,7 +43,7 @@ def read_reconstruction(path: str | os.PathLike[str]) -> Reconstruction:
     """
     place = Path(path)
     if place.is_dir():
-        if any(of.exists() for ending in ("bin", "txt") for of in _three(place, ending)):
+        if any(of.exists() for ending in ("bin", "txt") for of in ColmapFiles.of(place, ending).all):
             return _of_colmap(place)
         if any(place.glob("reconstruction*.json")):
             return read_opensfm(place)
@@ -51,7 +51,7 @@ def read_reconstruction(path: str | os.PathLike[str]) -> Reconstruction:
             f"{place}: holds neither a COLMAP model (cameras, images, points3D as .bin or .txt) nor an OpenSfM "
             "reconstruction*.json; give the folder with one, such as sparse/0, or a file."
         )
-    if place.name in {of.name for ending in ("bin", "txt") for of in _three(Path(), ending)}:
+    if place.name in {of.name for ending in ("bin", "txt") for of in ColmapFiles.of(Path(), ending).all}:
         return _of_colmap(place.parent)
     if place.suffix.lower() == ".json":
         read_bytes(place)
@@ -59,11 +59,6 @@ def read_reconstruction(path: str | os.PathLike[str]) -> Reconstruction:
     data = read_bytes(place)
     contents = problem_of_bytes(data, os.fspath(path))
     return _of_problem(contents.problem, place, "jaxba" if data.startswith(ZIP_MAGIC) else "BAL")
-
-
-def _three(folder: Path, ending: str) -> tuple[Path, Path, Path]:
-    files = ColmapFiles.of(folder, ending)
-    return files.cameras, files.images, files.points
 
 
 def _of_colmap(folder: Path) -> Reconstruction:

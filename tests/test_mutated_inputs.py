@@ -22,9 +22,12 @@ from jaxba.io import (
     parse_control,
     parse_geotags,
     read_bal,
+    read_colmap_binary,
     read_colmap_text,
     read_problem,
+    read_reconstruction,
     read_tile,
+    write_colmap_binary,
     write_csv_cloud,
     write_ply,
     write_tile,
@@ -48,6 +51,12 @@ COLMAP = {
     "rigs": b"1 2 CAMERA 1 CAMERA 2 1 0.6 0 0 0.8 -1 0 5\n",
     "frames": b"1 1 1 0 0 0 0 0 5 2 CAMERA 1 1 CAMERA 2 2\n",
 }
+OPENSFM = (
+    b'[{"cameras": {"c": {"projection_type": "brown", "width": 100, "height": 80, "focal_x": 0.9, "focal_y": 0.9}},'
+    b'"shots": {"a.jpg": {"rotation": [0, 0, 0], "translation": [0, 0, 5], "camera": "c"}},'
+    b'"points": {"7": {"color": [1, 2, 3], "coordinates": [1, 2, 3]}}}]'
+)
+TRACKS = b"OPENSFM_TRACKS_VERSION_v2\na.jpg\t7\t1\t0.1\t0.2\t0.01\t1\t2\t3\t-1\t-1\n"
 GCP = (
     b"EPSG:32615\n576308.6 5183424.7 198.2 12 9 a.jpg g1\n576308.6 5183424.7 198.2 3 9 b (2).jpg g1 x\n",
     b"# EPSG:32615\nname,x,y,z,px,py,image,std_h,std_v,role\ng1,576308.6,5183424.7,,12,9,a.jpg,0.01,0.02,check\n",
@@ -145,6 +154,27 @@ def colmap(rng: np.random.Generator, folder: Path) -> None:
     read_colmap_text(folder)
 
 
+def colmap_binary(rng: np.random.Generator, folder: Path) -> None:
+    for name in ("rigs", "frames"):
+        (folder / f"{name}.txt").unlink(missing_ok=True)
+    for name in ("cameras", "images", "points3D"):
+        written(folder / f"{name}.txt", COLMAP[name])
+    model = read_colmap_text(folder)
+    write_colmap_binary(folder, model.block, model.names, model.size_px, model.error_px)
+    chosen = folder / f"{('cameras', 'images', 'points3D')[rng.integers(3)]}.bin"
+    data = bytearray(chosen.read_bytes())
+    for _ in range(rng.integers(1, 4)):
+        data[rng.integers(len(data))] = rng.integers(256)
+    written(chosen, bytes(data[: rng.integers(len(data))] if rng.random() < 0.3 else data))
+    read_colmap_binary(folder)
+
+
+def opensfm(rng: np.random.Generator, folder: Path) -> None:
+    written(folder / "reconstruction.json", damaged(rng, OPENSFM) if rng.random() < 0.7 else OPENSFM)
+    written(folder / "tracks.csv", damaged(rng, TRACKS))
+    read_reconstruction(folder / "reconstruction.json")
+
+
 def control(rng: np.random.Generator, folder: Path) -> None:
     given = Given(photos=folder, gcp=written(folder / "gcp.txt", damaged(rng, GCP[rng.integers(len(GCP))])))
     parse_control(read_lists(given)["gcp"][1], is_photo="b (2).jpg".__eq__)
@@ -179,7 +209,9 @@ def written(path: Path, data: bytes) -> Path:
     return path
 
 
-READERS: list[Callable[[np.random.Generator, Path], None]] = [tile, noise, bal, colmap, control, geotags, toml, cloud]
+READERS: list[Callable[[np.random.Generator, Path], None]] = [
+    tile, noise, bal, colmap, colmap_binary, opensfm, control, geotags, toml, cloud,
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("read", READERS, ids=lambda read: read.__name__)

@@ -1,7 +1,7 @@
 """Shapes of plans: sizes and choices that the compiled code depends on, and how several problems come to share them.
 
-Compiling costs seconds, so every count is rounded up to one of eight sizes an octave. Small counts, whose padding costs no
-more than a millisecond or two, are rounded up to one of two, and tiny ones to one size for all.
+Compiling costs seconds, so every count is rounded up to one of eight sizes an octave. Small counts, whose padding costs
+a millisecond or two, are rounded up to one of two, and tiny ones to one size for all.
 """
 
 import dataclasses

@@ -295,6 +295,34 @@ def report(
 
 
 @app.command(
+    help="Audit another program's result: what its files state beside what their own numbers give, and what a new "
+    "adjustment of its measurements says. Writes report.html, report.json and report/ with tables and figures.\n\n"
+    "Exit codes: 0 no fault was found, 1 a fault was found, 2 bad input or options."
+)
+def audit(
+    model: Annotated[
+        Path,
+        Parameter(
+            help="A folder with a COLMAP model or an OpenSfM reconstruction with its tracks, a BAL problem, a tile.npz."
+        ),
+    ],
+    /,
+    *,
+    gcp: Annotated[
+        Path | None, Parameter(help="Control points: a gcp_list.txt or CSV, its marks by the model's image names.")
+    ] = None,
+    crs: Annotated[
+        str | None, Parameter(help="CRS of the results, and of a list that names none. [default: the list's]")
+    ] = None,
+    out: Annotated[Path, Parameter(help="The folder of the report.")] = Path("audit"),
+    json: _Json = False,
+) -> int:
+    from jaxba.cli._audit import run
+
+    return run(model, out=out, gcp=gcp, crs=crs, as_json=json)
+
+
+@app.command(
     help="Tell what a flight would give before it is flown: sigmas over the area, how the block may be bent, what "
     "oblique photos, a second height, RTK or control would gain. Of a project the same, from its own adjustment.\n\n"
     "Exit codes: 0 told, 2 bad input or options."

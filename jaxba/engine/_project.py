@@ -204,10 +204,10 @@ def read_lists(given: Given) -> dict[str, Any]:
     folder = given.photos.resolve()
     used = [path.resolve() for path in paths.values() if path is not None]
     return {
-        "geotags": _read_list(paths["geotags"], "a geo.txt or CSV"),
-        "gcp": _read_list(paths["gcp"], "a gcp_list.txt or CSV"),
-        "check": _read_list(paths["check"], "a gcp_list.txt or CSV"),
-        "bars": _read_list(paths["bars"], "a CSV of scale bars"),
+        "geotags": read_list(paths["geotags"], "a geo.txt or CSV"),
+        "gcp": read_list(paths["gcp"], "a gcp_list.txt or CSV"),
+        "check": read_list(paths["check"], "a gcp_list.txt or CSV"),
+        "bars": read_list(paths["bars"], "a CSV of scale bars"),
         "found_lists": tuple(name for name, path in paths.items() if path and getattr(given, name) is None),
         "own_lists": tuple(path.relative_to(folder).as_posix() for path in used if path.is_relative_to(folder)),
     }
@@ -235,7 +235,7 @@ def _among(photos: Path, usual: str) -> Path | None:
     return found[0] if found else None
 
 
-def _read_list(path: Path | None, kind: str) -> tuple[str, str] | None:
+def read_list(path: Path | None, kind: str) -> tuple[str, str] | None:
     """Return name and text of a list; None where none is given. `kind`: what it is to be, for messages."""
     if path is None:
         return None

@@ -9,6 +9,7 @@ from ._colmap import (
     write_colmap_binary as write_colmap_binary,
     write_colmap_text as write_colmap_text,
 )
+from ._colmap_model import ColmapModel as ColmapModel
 from ._crs import CrsText as CrsText
 from ._csv_bars import (
     BAR_RESULT_COLUMNS as BAR_RESULT_COLUMNS,
@@ -47,7 +48,10 @@ from ._opensfm import write_opensfm as write_opensfm
 from ._ply import write_ply as write_ply
 from ._problem import problem_of_bytes as problem_of_bytes, read_problem as read_problem
 from ._read import read_bytes as read_bytes, text_of as text_of
-from ._read_colmap import ColmapModel as ColmapModel, read_colmap_text as read_colmap_text
+from ._read_colmap import read_colmap as read_colmap, read_colmap_text as read_colmap_text
+from ._read_colmap_binary import read_colmap_binary as read_colmap_binary
+from ._read_opensfm import read_opensfm as read_opensfm
+from ._reconstruction import read_reconstruction as read_reconstruction
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
 from ._sites import (
     SITE_COLUMNS as SITE_COLUMNS,

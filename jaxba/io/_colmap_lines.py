@@ -16,6 +16,14 @@ def content_lines(path: Path, *, keep_blank: bool = False) -> Iterator[tuple[str
             yield f"{path}, line {number}", line.strip()
 
 
+def comment_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield place and text of each line of the comment that the file begins with."""
+    for number, line in enumerate(text_of(read_bytes(path), "replace").splitlines(), start=1):
+        if not line.startswith("#"):
+            return
+        yield f"{path}, line {number}", line.strip()
+
+
 def finite(words: Sequence[str]) -> list[float]:
     """Return finite numbers; raises `ValueError` for others."""
     numbers = [float(word) for word in words]

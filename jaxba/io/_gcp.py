@@ -127,11 +127,12 @@ def parse_control(
     name: str = "gcp_list.txt",
     unnamed: str = "point",
     is_photo: Callable[[str], bool] = no_photos,
+    crs: str = "",
 ) -> ControlList:
     """Return the points of a gcp_list.txt or CSV, each with its marks.
 
     - `name`: of the file, for messages. `unnamed`: what points without a name are called, with a number.
-    - `is_photo`: tells the names of photos, which may have blanks in them.
+    - `is_photo`: tells the names of photos, which may have blanks in them. `crs`: of a list that names none.
 
     Raises `JaxbaError` with file, line, field and value for what cannot be read, for a name with two places, and for a
     point that is marked twice in one photo.
@@ -144,13 +145,16 @@ def parse_control(
     if not content:
         raise JaxbaError(f"{name}: is empty; give a CRS line and a line a mark, or a CSV with a header line.")
     table = find_table(content, comments, _COLUMNS)
-    rows, notes = (_read_list(content, name, is_photo), []) if table is None else _read_csv(table, name)
+    rows, notes = (_read_list(content, name, is_photo, crs), []) if table is None else _read_csv(table, name, crs)
     if not rows:
         raise JaxbaError(f"{name}: lists no mark; give a line a mark below the first, or leave the list away.")
     return ControlList(points=_points(rows, unnamed), notes=tuple(notes))
 
 
-def _read_list(content: list[Line], name: str, is_photo: Callable[[str], bool]) -> list[_Row]:
+def _read_list(content: list[Line], name: str, is_photo: Callable[[str], bool], crs: str) -> list[_Row]:
+    first = number_or_nan(content[0][1].split()[0])
+    if crs and first == first:  # a mark: the list names no CRS
+        content = [(0, crs), *content]
     crs, _ = read_crs(content[0][1], f"{name} line {content[0][0]}", "gcp_list.txt")
     rows = []
     for line, words in content[1:]:
@@ -179,7 +183,7 @@ def _cells(words: str) -> list[str]:
     return by_tab if is_short and len(by_tab) == 6 and not by_tab[2] else cells
 
 
-def _read_csv(table: Table, name: str) -> tuple[list[_Row], list[str]]:
+def _read_csv(table: Table, name: str, crs: str) -> tuple[list[_Row], list[str]]:
     place, unused = columns_by_name(table.header, _COLUMNS)
     notes = [f"{name}: columns that are not used: {', '.join(unused)}."] if any(unused) else []
     is_geographic = "latitude" in place and "longitude" in place
@@ -200,7 +204,7 @@ def _read_csv(table: Table, name: str) -> tuple[list[_Row], list[str]]:
         where = f"{name} line {line}"
         x, y = _read_place(cell(x_name), cell(y_name), where, (x_name, y_name))
         px, py = (read_number(cell(column), where, column) for column in ("px", "py"))
-        text = cell("crs") or table.crs or ("EPSG:4326" if is_geographic else "")
+        text = cell("crs") or table.crs or crs or ("EPSG:4326" if is_geographic else "")
         if x != x:
             text = ""
         elif not text and "crs" not in place:

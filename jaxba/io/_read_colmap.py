@@ -1,68 +1,60 @@
-"""COLMAP's sparse models, text, as blocks: what `write_colmap_text` wrote, or COLMAP itself.
+"""COLMAP's sparse models: what `write_colmap_text` and `write_colmap_binary` wrote, or COLMAP itself.
 
-The three files say much twice, and what they say is held against each other: a point's track lists the keypoints that
-images.txt gives it, and where rigs.txt and frames.txt are there, as COLMAP 3.12 and later write them, the poses of
-images.txt follow from theirs. Blank lines are passed over where COLMAP does so: anywhere but as an image's second line.
+What is read, and what is held against each other, stands in `_colmap_model.py`; where rigs and frames are there, as
+COLMAP 3.12 and later write them, the poses of images follow from theirs. Blank lines of a text are passed over where
+COLMAP does so: anywhere but as an image's second line.
 """
 
 import os
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float, Int
-
 from jaxba._errors import JaxbaError
-from jaxba.io._colmap_lines import Damage, claim, content_lines, finite, unit
-from jaxba.io._colmap_rigs import refuse_other_poses
-from jaxba.scene import Block
+from jaxba.io._colmap_lines import Damage, claim, comment_lines, content_lines, finite
+from jaxba.io._colmap_model import (
+    PARAMETERS,
+    ColmapCamera,
+    ColmapFiles,
+    ColmapImage,
+    ColmapModel,
+    ColmapPoint,
+    check_camera,
+    check_image,
+    check_one_model,
+    model_of,
+)
+from jaxba.io._colmap_rigs import read_rigs_text, refuse_other_poses
+from jaxba.io._read_colmap_binary import read_colmap_binary
+from jaxba.scene import Claim
 
-_COUNTS = {
-    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
-    "FULL_OPENCV": 12,
-}  # fmt: skip
-_NO_POINT = -1
+_HEADER = re.compile(r"# Number of (cameras|images|points): (\d+)(?:, (mean [a-z ]+): (\S+))?")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ColmapModel:
-    """A model's block, its images by IMAGE_ID, its points by POINT3D_ID, and what a block does not hold.
+def read_colmap(folder: str | os.PathLike[str]) -> ColmapModel:
+    """Return the model in a folder, binary or text; where both are there the binary one, as COLMAP does.
 
-    - `names`: of the images. `size_px`: width and height of each camera's. `error_px`: of each point as the file has
-      it. `block.image_index` is IMAGE_ID - 1, `block.camera_names` the CAMERA_IDs; the world is any frame and scale.
+    Raises:
+        JaxbaError: the folder holds no model, or as `read_colmap_text` does.
     """
-
-    block: Block
-    names: tuple[str, ...]
-    size_px: Int[np.ndarray, "cameras 2"]
-    error_px: Float[np.ndarray, " points"]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Image:
-    """An image with its keypoints as images.txt has them; `place`: file and line."""
-
-    place: str
-    image_id: int
-    pose: list[float]
-    camera_id: int
-    name: str
-    xy_px: list[list[float]]
-    point_ids: list[int]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Point:
-    """A point as points3D.txt has it; `track`: pairs of IMAGE_ID and the keypoint's place in that image."""
-
-    place: str
-    point_id: int
-    xyz: list[float]
-    rgb: list[int]
-    error_px: float
-    track: list[tuple[int, int]]
+    path = Path(folder)
+    if not path.is_dir():
+        raise JaxbaError(f"{path}: no such folder; give one with a COLMAP model.")
+    found = {kind: [of for of in ColmapFiles.of(path, kind).all if of.exists()] for kind in ("bin", "txt")}
+    for kind, read in (("bin", read_colmap_binary), ("txt", read_colmap_text)):
+        if len(found[kind]) == 3:
+            return read(path)
+    there = found["bin"] or found["txt"]
+    if not there:
+        raise JaxbaError(
+            f"{path}: holds no COLMAP model, neither cameras.bin, images.bin, points3D.bin nor the same as .txt; give "
+            "the folder with these, such as sparse/0."
+        )
+    missing = [of.name for of in ColmapFiles.of(path, there[0].suffix[1:]).all if not of.exists()]
+    raise JaxbaError(
+        f"{path / missing[0]}: no such file beside {there[0].name}; a model has cameras, images and points3D: export "
+        "or copy it again."
+    )
 
 
 def read_colmap_text(folder: str | os.PathLike[str]) -> ColmapModel:
@@ -76,75 +68,48 @@ def read_colmap_text(folder: str | os.PathLike[str]) -> ColmapModel:
             or tracks contradict each other, poses do not follow from rigs.txt and frames.txt, or cameras are of a model
             that jaxba has not, or of several.
     """
-    path = Path(folder)
-    model, camera_ids, parameters, size_px = _cameras(path / "cameras.txt")
-    points = sorted(_points(path / "points3D.txt"), key=lambda point: point.point_id)
-    images = sorted(_images(path / "images.txt", camera_ids), key=lambda image: image.image_id)
-    refuse_other_poses(path, [(i.place, i.image_id, i.camera_id, i.pose) for i in images])
-    row_of_point = {point.point_id: row for row, point in enumerate(points)}
-    row_of_camera = {camera_id: row for row, camera_id in enumerate(camera_ids)}
-    _refuse_contradictions(images, points)
-    seen = [[k for k, point_id in enumerate(image.point_ids) if point_id != _NO_POINT] for image in images]
-    block = Block(
-        image_index=np.array([image.image_id for image in images], dtype=np.int64) - 1,
-        quaternion=np.array([unit(image.pose[:4]) for image in images]),
-        translation_m=np.array([image.pose[4:] for image in images]),
-        camera_model=model,
-        camera_names=tuple(str(camera_id) for camera_id in camera_ids),
-        camera_parameters=parameters,
-        camera_index=np.array([row_of_camera[image.camera_id] for image in images], dtype=np.int64),
-        points_m=np.array([point.xyz for point in points]),
-        track_index=np.arange(len(points)),
-        rgb=np.array([point.rgb for point in points], dtype=np.uint8),
-        observation_image=np.repeat(np.arange(len(images)), [len(rows) for rows in seen]),
-        observation_point=np.array(
-            [row_of_point[i.point_ids[k]] for i, rows in zip(images, seen, strict=True) for k in rows], dtype=np.int64
-        ),
-        observation_xy_px=np.array(
-            [i.xy_px[k] for i, rows in zip(images, seen, strict=True) for k in rows], dtype=float
-        ).reshape(-1, 2),
-        is_georeferenced=False,
-    )
-    names = tuple(image.name for image in images)
-    return ColmapModel(
-        block=block, names=names, size_px=size_px, error_px=np.array([point.error_px for point in points])
-    )
+    files = ColmapFiles.of(Path(folder), "txt")
+    cameras = _cameras(files.cameras)
+    check_one_model(files.cameras, cameras)
+    points, images = _points(files.points), _images(files.images, cameras)
+    refuse_other_poses(read_rigs_text(Path(folder)), images)
+    claims = [found for path in (files.cameras, files.images, files.points) for found in _claims(path)]
+    return model_of(files, cameras, images, points, claims)
 
 
-def _cameras(path: Path) -> tuple[str, list[int], Float[np.ndarray, "cameras n"], Int[np.ndarray, "cameras 2"]]:
-    rows: dict[int, tuple[list[int], list[float]]] = {}
+def _claims(path: Path) -> list[Claim]:
+    """Return what the comments of a file say of the model."""
+    found = []
+    for place, line in comment_lines(path):
+        match = _HEADER.match(line)
+        if match is None:
+            continue
+        name, count, mean, value = match.groups()
+        found.append(Claim(name=name, stated=float(count), place=place))
+        if mean is not None:
+            with Damage(place):
+                found.append(Claim(name=mean, stated=finite([value])[0], place=place))
+    return found
+
+
+def _cameras(path: Path) -> dict[int, ColmapCamera]:
+    cameras: dict[int, ColmapCamera] = {}
     places: dict[int, str] = {}
-    models = set()
     for place, line in content_lines(path):
         with Damage(place):
             words = line.split()
             camera_id, name = int(words[0]), words[1]
-            row = [int(words[2]), int(words[3])], finite(words[4:])
-        if name not in _COUNTS:
-            raise JaxbaError(f"{place}: camera model {name}; jaxba has {', '.join(_COUNTS)}.")
-        if len(words) != 4 + _COUNTS[name]:
-            raise JaxbaError(f"{place}: {len(words) - 4} parameters, but {name} has {_COUNTS[name]}.")
+            size_px = int(words[2]), int(words[3])
+            parameters = finite(words[4:]) if name in PARAMETERS else []
+        camera = ColmapCamera(place=place, model=name, size_px=size_px, parameters=parameters)
+        check_camera(camera)
         claim(places, camera_id, place, "camera")
-        rows[camera_id] = row
-        models.add(name)
-    if len(models) != 1:
-        found = ", ".join(sorted(models)) or "none"
-        raise JaxbaError(f"{path}: cameras of one model are needed, it has {found}; convert them to one model.")
-    ids, (model,) = sorted(rows), models
-    parameters = np.array([rows[i][1] for i in ids])
-    if model == "FULL_OPENCV":
-        if np.any(parameters[:, 9:]):
-            raise JaxbaError(f"{path}: FULL_OPENCV with k4, k5 or k6 other than 0 has no model here; refine without.")
-        model, parameters = "OPENCV", parameters[:, :9]
-    elif model == "OPENCV":
-        parameters = np.pad(parameters, ((0, 0), (0, 1)))
-    with Damage(f"{path}"):
-        size_px = np.array([rows[i][0] for i in ids], dtype=np.int64)
-    return model, ids, parameters, size_px
+        cameras[camera_id] = camera
+    return cameras
 
 
-def _points(path: Path) -> list[_Point]:
-    points: list[_Point] = []
+def _points(path: Path) -> list[ColmapPoint]:
+    points: list[ColmapPoint] = []
     places: dict[int, str] = {}
     with Damage(str(path)) as damage:
         for damage.place, line in content_lines(path):
@@ -155,19 +120,17 @@ def _points(path: Path) -> list[_Point]:
             rgb, track = [int(word) for word in words[4:7]], [int(word) for word in words[8:]]
             if not all(0 <= value <= 255 for value in rgb):
                 raise ValueError(f"the colour {rgb} is not of three numbers from 0 to 255")
-            point = _Point(
+            point = ColmapPoint(
                 place=damage.place, point_id=int(words[0]), xyz=xyz, rgb=rgb, error_px=error,
                 track=list(zip(track[0::2], track[1::2], strict=True)),
             )  # fmt: skip
             claim(places, point.point_id, point.place, "point")
             points.append(point)
-    if not points:
-        raise JaxbaError(f"{path}: holds no point; export the model again.")
     return points
 
 
-def _images(path: Path, camera_ids: Sequence[int]) -> list[_Image]:
-    images: list[_Image] = []
+def _images(path: Path, cameras: Mapping[int, ColmapCamera]) -> list[ColmapImage]:
+    images: list[ColmapImage] = []
     places: dict[int, str] = {}
     lines = content_lines(path, keep_blank=True)
     for place, head in lines:
@@ -184,56 +147,11 @@ def _images(path: Path, camera_ids: Sequence[int]) -> list[_Image]:
             fields = head.split(maxsplit=9)
             if len(fields) != 10:
                 raise ValueError(f"{len(fields)} fields of 10")
-            image = _Image(
+            image = ColmapImage(
                 place=place, image_id=int(fields[0]), pose=finite(fields[1:8]), camera_id=int(fields[8]),
                 name=fields[9], xy_px=[xy[k : k + 2] for k in range(0, len(xy), 2)], point_ids=point_ids,
             )  # fmt: skip
         claim(places, image.image_id, place, "image")
-        if image.camera_id not in camera_ids:
-            raise JaxbaError(f"{place}: image {image.image_id} has camera {image.camera_id}, which cameras.txt lacks.")
-        if not any(image.pose[:4]):
-            raise JaxbaError(f"{place}: image {image.image_id} has a quaternion of zeros; export the model again.")
+        check_image(image, cameras, "cameras.txt")
         images.append(image)
-    if not images:
-        raise JaxbaError(f"{path}: holds no image; export the model again.")
     return images
-
-
-def _refuse_contradictions(images: Sequence[_Image], points: Sequence[_Point]) -> None:
-    """Raise where keypoints and tracks do not say the same."""
-    of_image = {image.image_id: image for image in images}
-    of_point = {point.point_id: point for point in points}
-    for image in images:
-        unknown = next((i for i in image.point_ids if i != _NO_POINT and i not in of_point), None)
-        if unknown is not None:
-            raise JaxbaError(f"{image.place}: image {image.image_id} sees point {unknown}, which points3D.txt lacks.")
-    seen = Counter(point_id for image in images for point_id in image.point_ids)
-    for point in points:
-        says = f"{point.place}: the track of point {point.point_id}"
-        if len(set(point.track)) != len(point.track):
-            raise JaxbaError(f"{says} lists a keypoint twice; export the model again.")
-        track = {(image_id, k) for image_id, k in point.track if image_id in of_image}
-        for image_id, k in sorted(track):
-            image = of_image[image_id]
-            if not 0 <= k < len(image.point_ids):
-                raise JaxbaError(
-                    f"{says} has keypoint {k} of image {image_id}, which has {len(image.point_ids)} ({image.place}); "
-                    "export the model again."
-                )
-            if image.point_ids[k] != point.point_id:
-                raise JaxbaError(
-                    f"{says} has keypoint {k} of image {image_id}, which is of point {image.point_ids[k]} by "
-                    f"{image.place}; export the model again."
-                )
-        if track and len(track) != seen[point.point_id]:
-            image, k = next(
-                (image, k)
-                for image in images
-                for k, point_id in enumerate(image.point_ids)
-                if point_id == point.point_id and (image.image_id, k) not in track
-            )
-            twice = " twice" if image.point_ids.count(point.point_id) > 1 else ""
-            raise JaxbaError(
-                f"{image.place}: image {image.image_id} sees point {point.point_id}{twice}, at keypoint {k}, which the "
-                f"point's track lacks ({point.place}); export the model again."
-            )

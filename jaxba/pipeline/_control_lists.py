@@ -15,11 +15,16 @@ _PLACE = ("crs", "x", "y", "z_m")
 
 
 def points_of_lists(
-    gcp: tuple[str, str] | None, check: tuple[str, str] | None, check_names: str | None, photos: Sequence[Photo]
+    gcp: tuple[str, str] | None,
+    check: tuple[str, str] | None,
+    check_names: str | None,
+    photos: Sequence[Photo],
+    crs: str = "",
 ) -> tuple[list[SurveyedPoint], list[str]]:
     """Return the points of both lists, check points marked as such, and notes.
 
-    - `gcp`, `check`: name and text of the lists. `check_names`: of points that are check points in either.
+    - `gcp`, `check`: name and text of the lists. `check_names`: of points that are check points in either. `crs`: of
+      a list that names none.
     """
     notes: list[str] = []
     found: dict[str, SurveyedPoint] = {}
@@ -27,7 +32,7 @@ def points_of_lists(
     for entry, is_check in ((gcp, False), (check, True)):
         if entry is None:
             continue
-        read: ControlList = parse_control(entry[1], entry[0], "check" if is_check else "point", is_photo)
+        read: ControlList = parse_control(entry[1], entry[0], "check" if is_check else "point", is_photo, crs)
         notes += read.notes
         for point in read.points:
             same = found.get(point.name) if point.is_named else None

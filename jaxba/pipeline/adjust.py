@@ -49,6 +49,7 @@ class Inputs:
     - `features`: of every photo, by its index, to complete tracks from; opened one after the other.
     - `control`: surveyed points. `bars`: known distances between marked points.
     - `chunk_size`: images of a tile, for a block that has more; None for one that has not.
+    - `held`: intrinsics that stay as they are, by name.
     """
 
     photos: tuple[Photo, ...]
@@ -60,6 +61,7 @@ class Inputs:
     control: Control = field(default_factory=Control.nothing)
     bars: ScaleBars = field(default_factory=ScaleBars.nothing)
     chunk_size: int | None = None
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,10 +163,15 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
 
     Raises `JaxbaError` where it has fewer than two images, or no point of it is left.
     """
+    return run_and_keep(inputs, params, room)[0]
+
+
+def run_and_keep(inputs: Inputs, params: Params, room: Room | None = None) -> tuple[Outputs, Any]:
+    """Return what `run` does, and the `jaxba.sfm.Adjusted` behind it, whose problem can be asked for more."""
     from jaxba import sfm  # loads jax, which `--help` must not
 
     options = {f.name: getattr(params, f.name) for f in fields(params) if f.name != "min_angle"}
-    settings = sfm.Settings(min_angle_rad=float(np.deg2rad(params.min_angle)), **options)
+    settings = sfm.Settings(min_angle_rad=float(np.deg2rad(params.min_angle)), held=inputs.held, **options)
     reference, photos = inputs.reference, inputs.photos
     tiling = sfm.Tiling(chunk_size=inputs.chunk_size or inputs.block.num_images)
     if room is not None:
@@ -214,7 +221,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         *(Finding.of("note", text=f"{note}.") for note in notes),
     )
     total = np.bincount(block.observation_point, adjusted.error_px, minlength=block.num_points)
-    return Outputs(
+    outputs = Outputs(
         block=block,
         error_px=adjusted.error_px,
         point_error_px=total / np.bincount(block.observation_point, minlength=block.num_points),
@@ -250,6 +257,7 @@ def run(inputs: Inputs, params: Params, room: Room | None = None) -> Outputs:
         position_covariance_m2=_position_covariance(sigmas),
         limit_px=adjusted.limit_px,
     )
+    return outputs, adjusted
 
 
 def _position_covariance(sigmas: Any) -> Float[np.ndarray, "images 3 3"]:

@@ -38,7 +38,7 @@ class Inputs:
     """- `photos`, `reference`: of the stages before. `target_crs`: that was asked for.
 
     - `gcp`, `check`, `bars`: name and text of the lists; None where there is none. `is_gcp_found`: nobody named `gcp`,
-      which lies among the photos.
+      which lies among the photos. `list_crs`: of a list that names none.
     """
 
     photos: tuple[Photo, ...]
@@ -48,6 +48,7 @@ class Inputs:
     check: tuple[str, str] | None = None
     bars: tuple[str, str] | None = None
     is_gcp_found: bool = False
+    list_crs: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +133,7 @@ def run(inputs: Inputs, params: Params) -> Outputs:
 def _placed(inputs: Inputs, params: Params) -> Outputs:
     """Return the points of the lists in the local frame, and the scale bars."""
     names = " and ".join(entry[0] for entry in (inputs.gcp, inputs.check) if entry is not None)
-    every, notes = points_of_lists(inputs.gcp, inputs.check, params.check, inputs.photos)
+    every, notes = points_of_lists(inputs.gcp, inputs.check, params.check, inputs.photos, inputs.list_crs)
     before_marks = len(notes)
     every.sort(key=lambda point: not point.is_surveyed)
     points = [point for point in every if point.is_surveyed]

@@ -2,6 +2,7 @@ from . import diagnosis as diagnosis, verification as verification
 from ._accuracy import Accuracy as Accuracy, accuracy as accuracy, accuracy_row as accuracy_row
 from ._bars import bar_facts as bar_facts, bar_rows as bar_rows
 from ._control import control_facts as control_facts, control_lines as control_lines, control_rows as control_rows
+from ._control_findings import CONTROL_KINDS as CONTROL_KINDS
 from ._findings import is_to_act_on as is_to_act_on, sentence as sentence, sentences as sentences
 from ._pairs import pair_facts as pair_facts, pair_lines as pair_lines
 from ._picture import Picture as Picture, draw_picture as draw_picture

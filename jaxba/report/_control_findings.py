@@ -206,3 +206,4 @@ CONTROL_WORDS: dict[str, Callable[..., str]] = {
     "control point contradicts": _contradicts,
     "gnss off control": _gnss_off,
 }
+CONTROL_KINDS = tuple(CONTROL_WORDS)

@@ -9,13 +9,14 @@ import math
 from collections.abc import Callable, Sequence
 
 from jaxba.engine._words import many
+from jaxba.report._audit_findings import AUDIT_WORDS
 from jaxba.report._bars import BAR_WORDS
 from jaxba.report._control_findings import CONTROL_WORDS, along_axes
 from jaxba.scene import Finding
 
 _MOST_NAMES = 10
 _MOST_ROWS = 8
-_TO_KNOW = ("edges left out", "common offset", "scale by bars")
+_TO_KNOW = ("edges left out", "common offset", "scale by bars", "audit note")
 _DATUMS = {"ellipsoidal": "the WGS 84 ellipsoid", "mean_sea_level": "mean sea level (no geoid named)"}
 _TURNS = {1: "a quarter turn", 2: "half a turn", 3: "a quarter turn"}
 _LOOKS = {
@@ -271,6 +272,7 @@ WORDS: dict[str, Callable[..., str]] = {
     "common offset": _common_offset,
     "height datum assumed": _height_datum_assumed,
     "attitudes contradict": _attitudes_contradict,
+    **AUDIT_WORDS,
     **BAR_WORDS,
     **CONTROL_WORDS,
 }

@@ -14,6 +14,7 @@ from jaxba.scene._footprint import Footprints, footprint_overlaps, footprint_pai
 from jaxba.scene._graph import components
 from jaxba.scene._pair_record import Fallback, Missed, Model, PairRecord
 from jaxba.scene._photo import Fix, FocalSource, HeightKind, LeftOut, Lens, Photo, PhotoFile, Position
+from jaxba.scene._reconstruction import Claim, Reconstruction
 from jaxba.scene._reference import AssumedDatum, CommonOffset, FlightOffsets, LocalFrame, Reference
 from jaxba.scene._scale_bars import BarFit, ScaleBars
 from jaxba.scene._survey_statistics import MeasuredKind, SurveyStatistics
@@ -22,10 +23,10 @@ from jaxba.scene._tracks import Tracks
 from jaxba.scene._view_graph import EdgeStatus, PrunedEdge, ViewGraph
 
 __all__ = [
-    "AssumedDatum", "Attitude", "BarFit", "Block", "CommonOffset", "Control", "ControlFit", "EdgeStatus", "Fallback",
-    "Features", "Finding", "Fix", "FlightOffsets", "FocalSource", "Footprints", "HeightKind", "LeftOut", "Lens",
-    "LocalFrame", "MeasuredKind", "Missed", "Model", "PairRecord", "Photo", "PhotoFile", "Position", "PrunedEdge",
-    "Reference", "ScaleBars", "SurveyStatistics", "Tracks", "ViewGraph", "build_tracks", "cam_from_enu", "components",
-    "described", "fault", "footprint_overlaps", "footprint_pairs", "ground_footprints", "joining_pairs",
-    "lacks_memory", "nearest_pairs", "pairs_between", "rising_pairs", "window_pairs",
+    "AssumedDatum", "Attitude", "BarFit", "Block", "Claim", "CommonOffset", "Control", "ControlFit", "EdgeStatus",
+    "Fallback", "Features", "Finding", "Fix", "FlightOffsets", "FocalSource", "Footprints", "HeightKind", "LeftOut",
+    "Lens", "LocalFrame", "MeasuredKind", "Missed", "Model", "PairRecord", "Photo", "PhotoFile", "Position",
+    "PrunedEdge", "Reconstruction", "Reference", "ScaleBars", "SurveyStatistics", "Tracks", "ViewGraph", "build_tracks",
+    "cam_from_enu", "components", "described", "fault", "footprint_overlaps", "footprint_pairs", "ground_footprints",
+    "joining_pairs", "lacks_memory", "nearest_pairs", "pairs_between", "rising_pairs", "window_pairs",
 ]  # fmt: skip

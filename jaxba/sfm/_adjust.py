@@ -159,8 +159,10 @@ def adjust(
     std_px, converged, settled, num_judged = 1.0, False, False, block.num_observations
     limit_px, shape = None, rounds.shape(block, tracks)
     mark_used = np.ones(len(control.mark_point), bool)
-    small = free_parameters(block.camera_model, num_images=0)
-    every = free_parameters(block.camera_model, num_images=block.num_images)
+    small, every = (
+        [name for name in free_parameters(block.camera_model, num_images=num) if name not in settings.held]
+        for num in (0, block.num_images)
+    )
     while True:
         last = len(medians) + 1 >= settings.max_rounds
         free = every if medians or last else small

@@ -36,7 +36,7 @@ _TELL_EVERY_S = 1.0
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What may be set of the adjustment in rounds; see the adjust stage's parameters."""
+    """What may be set of the adjustment in rounds; see the adjust stage's parameters, and its inputs for `held`."""
 
     loss: str = "huber"
     f_scale: float = 1.0
@@ -49,6 +49,7 @@ class Settings:
     min_angle_rad: float = 0.026
     max_rounds: int = 5
     complete_radius: float = 4.0
+    held: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

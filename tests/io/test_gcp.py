@@ -26,6 +26,21 @@ def test_documented_form_is_read():
     assert not first.is_check and first.std_h_m is None
 
 
+def test_a_crs_that_is_given_is_that_of_lists_that_name_none():
+    mark = "576308.6 5183424.7 198.2 1200 900 a.jpg g1"
+    table = "name,x,y,z,px,py,image\ng1,576308.6,5183424.7,198.2,1200,900,a.jpg"
+    for text, expected in (
+        (mark, "EPSG:32616"),
+        (f"EPSG:32615\n{mark}", "EPSG:32615"),
+        (table, "EPSG:32616"),
+        (f"# EPSG:32615\n{table}", "EPSG:32615"),
+    ):
+        (point,) = parse_control(text, crs="EPSG:32616").points
+        assert (point.crs, point.x, len(point.marks)) == (expected, 576308.6, 1)
+    with pytest.raises(JaxbaError, match=r"gcp_list\.txt line 2: '5 6' has 2 columns"):
+        parse_control(f"{mark}\n5 6", crs="EPSG:32616")
+
+
 def test_points_without_names_are_told_apart_by_their_coordinates():
     text = "EPSG:32615\n1 2 3 10 20 a.jpg\n4 5 6 11 21 a.jpg point2\n7 8 9 12 22 a.jpg\n1 2 3 13 23 b.jpg\n"
     found = {point.name: [m.image for m in point.marks] for point in parse_control(text).points}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from audit_cases import AUDIT_CASES
 
 import jaxba
 from jaxba.engine._key import Key
@@ -16,6 +17,7 @@ from jaxba.scene import Finding
 
 NAN, INF = float("nan"), float("inf")
 CASES = [
+    *AUDIT_CASES,
     (
         Finding.of("note", text="A note."),
         "A note.",
@@ -490,7 +492,7 @@ def test_what_is_not_known_is_left_out_of_a_sentence(finding: Finding, words: st
 
 def test_what_was_done_is_told_apart_from_what_asks_for_something():
     kinds = {finding.kind for finding, _ in CASES if not is_to_act_on(finding)}
-    assert kinds == {"edges left out", "common offset", "scale by bars"}
+    assert kinds == {"edges left out", "common offset", "scale by bars", "audit note"}
 
 
 def test_more_than_ten_photos_are_counted():
@@ -504,8 +506,9 @@ def test_counts_of_a_sentence_are_written_alike():
 
 
 def test_every_kind_that_can_be_found_has_words_and_a_case():
-    folder = Path(jaxba.__file__).parent / "sfm"
-    sources = "".join(path.read_text() for path in folder.rglob("*findings.py"))
+    folder = Path(jaxba.__file__).parent
+    paths = [*(folder / "sfm").rglob("*findings.py"), folder / "audit" / "_faults.py"]
+    sources = "".join(path.read_text() for path in paths)
     found = set(re.findall(r'Finding\.of\(\s*"([^"]+)"', sources))
     assert found == set(WORDS) == {finding.kind for finding, _ in CASES}
 

@@ -36,7 +36,7 @@ def tables(facts: Mapping[str, Any]) -> dict[str, bytes]:
         for camera in facts.get("cameras", ())
         for parameter in camera["parameters"]
     ]
-    processing = facts.get("processing", {})
+    processing, audit = facts.get("processing", {}), facts.get("audit", {})
     found = {
         "photos": facts.get("photos", ()),
         "pairs": pairs,
@@ -47,6 +47,7 @@ def tables(facts: Mapping[str, Any]) -> dict[str, bytes]:
         "accuracy": facts.get("accuracy", {}).get("rows", ()),
         "left_out": facts.get("left_out", ()),
         "parameters": processing.get("parameters", ()),
+        **{f"audit_{name}": audit.get(name, ()) for name in ("claims", "intrinsics", "images")},
     }
     return {f"{name}.csv": _csv(rows) for name, rows in found.items() if rows}
 

@@ -3,6 +3,7 @@
 The form is told in `_schema.py`. Numbers that are not known are None; a section that has no data says why in `none`.
 """
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +45,36 @@ def report_facts(folder: Path, pipeline: Pipeline) -> dict[str, Any]:
         defaults=pipeline.settings,
         seconds=seconds if isinstance(seconds, dict) else {},
     )
-    rows = lights(material)
+    return facts_of(
+        material,
+        project=_project(material, project),
+        left_out=_left_out(material, pipeline),
+        processing=_processing(material, project, pipeline),
+    )
+
+
+def facts_of(
+    material: Material,
+    *,
+    project: Mapping[str, Any],
+    left_out: Sequence[Mapping[str, str]],
+    processing: Mapping[str, Any],
+    audit: Mapping[str, Any] | None = None,
+    more_lights: Sequence[dict[str, Any]] = (),
+) -> dict[str, Any]:
+    """Return the facts of records, of a project or of an audit.
+
+    - `project`, `left_out`, `processing`, `audit`: these sections. `more_lights`: before those of the records.
+    """
+    rows = [*more_lights, *lights(material)]
     photos = photo_rows(material)
     facts = {
         "schema": SCHEMA,
-        "project": _project(material, project),
+        "project": project,
+        **({} if audit is None else {"audit": audit}),
         "verdict": verdict(material, rows),
         "quality": rows,
-        "findings": sentences(found.findings),
+        "findings": sentences(material.found.findings),
         "summary": [],
         "sigmas": sigmas(material),
         "cloud": cloud(material),
@@ -67,8 +90,8 @@ def report_facts(folder: Path, pipeline: Pipeline) -> dict[str, Any]:
         "bars": bars(material),
         "statistics": statistics(material),
         "accuracy": accuracy_section(material),
-        "left_out": _left_out(material, pipeline),
-        "processing": _processing(material, project, pipeline),
+        "left_out": left_out,
+        "processing": processing,
         "glossary": [{"term": term, "text": text} for term, text in GLOSSARY.items()],
     }
     facts["summary"] = key_figures(material, facts)

@@ -7,6 +7,8 @@ section that has no data holds the field `none` alone: the reason, in a sentence
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from jaxba.report.document._audit_schema import AUDIT_FIELDS
+
 SECTIONS_WITHOUT_DATA = (
     *("sigmas", "cloud", "pairs", "overlap", "residuals", "correlation", "positions", "attitudes"),
     *("control", "bars", "statistics", "accuracy"),
@@ -36,6 +38,7 @@ FIELDS = {
     "quality[].text": "what the figure is",
     "quality[].limits": "by which limits it is judged",
     "findings[]": "what a surveyor should know, in sentences",
+    **AUDIT_FIELDS,
     "summary[].name": "a key figure",
     "summary[].value": "its value with the unit",
     "sigmas.scope": "what sigmas of cameras and points are of: absolute; within the block, without what all of it may "

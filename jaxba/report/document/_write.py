@@ -26,6 +26,14 @@ def write_report(folder: Path, pipeline: Pipeline) -> tuple[Path, dict[str, Any]
     Raises `JaxbaError` where the folder is no project, or a file cannot be written.
     """
     facts = report_facts(folder, pipeline)
+    return write_facts(folder, facts), facts
+
+
+def write_facts(folder: Path, facts: dict[str, Any]) -> Path:
+    """Write the report of facts into a folder that is there; return the page's path.
+
+    Raises `JaxbaError` where a file cannot be written.
+    """
     with write_folder_atomically(folder / REPORT) as partial:
         for name, content in (*tables(facts).items(), *pngs(facts).items()):
             (partial / name).write_bytes(content)
@@ -33,7 +41,7 @@ def write_report(folder: Path, pipeline: Pipeline) -> tuple[Path, dict[str, Any]
     for path, text in ((folder / f"{REPORT}.json", f"{_json(facts)}\n"), (html, page(facts))):
         with write_atomically(path) as file:
             file.write(text.encode())
-    return html, facts
+    return html
 
 
 def _json(value: Any, indent: str = "") -> str:

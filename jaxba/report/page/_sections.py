@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from jaxba.report.page._audit_tables import audit_blocks
 from jaxba.report.page._cloud_views import in_space, preview
 from jaxba.report.page._drawing import Figure
 from jaxba.report.page._error_charts import correlation, histogram, radial_profile, sensor_field
@@ -52,7 +53,9 @@ def sections(report: dict[str, Any]) -> list[Section]:
     no_photos = None if report["photos"] else "There are no photos."
     no_points = _none(report["cloud"], "x", "There are no points.")
     sigmas, matches = sigma_map(report), match_graph(report)
+    audit = [_section("audit", "Audit of the model", None, *audit_blocks(report))] if "audit" in report else []
     return [
+        *audit,
         _section("preview", "The block from above", no_points, preview(report)),
         _section(
             "positions-map", "Cameras and their accuracy",
@@ -63,8 +66,7 @@ def sections(report: dict[str, Any]) -> list[Section]:
                  overlap_map(report)),
         _section(
             "matches", "Matches between photos",
-            _none(report["pairs"])
-            or (None if matches else "No photos that have a place were matched with each other."),
+            _none(report["pairs"]) or (None if matches else _no_matches(report)),
             matches, _told_pairs(report) if matches else None,
         ),
         _section("space", "The block in three dimensions", no_points, in_space(report)),
@@ -121,6 +123,12 @@ def _or_reason(found: dict[str, Any], figure: Figure | None) -> Iterable[Block]:
     if figure is not None:
         return [figure]
     return [f"Correlations: {found['none']}"] if "none" in found else []
+
+
+def _no_matches(report: dict[str, Any]) -> str:
+    if "audit" in report:
+        return "The files of a model hold points and their observations, and no matches between photos."
+    return "No photos that have a place were matched with each other."
 
 
 def _told_pairs(report: dict[str, Any]) -> str:

@@ -1,0 +1,1 @@
+from ._audit import Audited as Audited, audit as audit

@@ -7,9 +7,9 @@ jax's cache folder is for, and the function with the shapes and static fields of
 is (`jax_compilation_cache_dir`), and not at all without one, off the CPU, or where a class or function from elsewhere
 takes part, whose source nobody has read.
 
-On trial, and therefore only where the environment says `JAXBA_KEEP_PROGRAMS=1`. An executable that jax has read from
-its cache lacks a part of its code when it is written again, and fails only when another process calls it; jax also
-keeps it in memory, where it tells of no hit. So nothing is written but what jax tells that it has compiled just now.
+`JAXBA_KEEP_PROGRAMS=0` in the environment turns it off. An executable that jax has read from its cache lacks a part of
+its code when it is written again, and fails only when another process calls it; jax also keeps it in memory, where it
+tells of no hit. So nothing is written but what jax tells that it has compiled just now.
 """
 
 import functools
@@ -109,7 +109,7 @@ class _Leaf:
 def _folder() -> Path | None:
     """Return where programs are kept; None where they are not."""
     config: Any = jax.config
-    given = config.jax_compilation_cache_dir if os.environ.get("JAXBA_KEEP_PROGRAMS") == "1" else None
+    given = config.jax_compilation_cache_dir if os.environ.get("JAXBA_KEEP_PROGRAMS") != "0" else None
     if not given or not config.jax_enable_compilation_cache or not os.path.isdir(given):
         return None
     return Path(given) / "jaxba" if jax.default_backend() == "cpu" and jax.device_count() == 1 else None

@@ -54,7 +54,7 @@ _SETTINGS = _kept_programs._settings
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Where one test's programs are kept, jax's cache being empty; this module counts as one of jaxba's."""
-    monkeypatch.setenv("JAXBA_KEEP_PROGRAMS", "1")
+    monkeypatch.delenv("JAXBA_KEEP_PROGRAMS", raising=False)
     monkeypatch.setattr(_kept_programs, "_READ", (*_kept_programs._READ, __name__))
     before = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     for cache in (str(tmp_path), before):

@@ -126,7 +126,7 @@ def test_tiny_problems_share_one_shape() -> None:
 
 
 def test_plans_of_a_series_share_one_shape() -> None:
-    problem = small_problem(RADIAL, num_points=40)
+    problem = small_problem(RADIAL, num_points=400)
     seen = problem.observations
     few = np.sort(np.random.default_rng(0).permutation(problem.num_observations)[: int(0.7 * problem.num_observations)])
     part = Observations(*(np.asarray(column)[few] for column in (

@@ -23,7 +23,7 @@ def pngs(facts: Facts) -> dict[str, bytes]:
     """Return the files of a report's figures by name; one that has no data is left out."""
     figures: dict[str, tuple[bool, Callable[[Figure, Facts], None]]] = {
         "map": (_has_places(facts), _map),
-        "matches": (_has_places(facts) and bool(facts["pairs"]), _matches),
+        "matches": (_has_places(facts) and bool(facts["pairs"].get("first")), _matches),
         "overlap": ("rows" in facts["overlap"], _overlap),
         "residuals": ("histogram" in facts["residuals"], _residuals),
         "correlation": ("names" in facts["correlation"], _correlation),

@@ -66,7 +66,7 @@ def sections(report: dict[str, Any]) -> list[Section]:
                  overlap_map(report)),
         _section(
             "matches", "Matches between photos",
-            _none(report["pairs"]) or (None if matches else _no_matches(report)),
+            None if matches else _no_matches(report),
             matches, _told_pairs(report) if matches else None,
         ),
         _section("space", "The block in three dimensions", no_points, in_space(report)),
@@ -128,7 +128,7 @@ def _or_reason(found: dict[str, Any], figure: Figure | None) -> Iterable[Block]:
 def _no_matches(report: dict[str, Any]) -> str:
     if "audit" in report:
         return "The files of a model hold points and their observations, and no matches between photos."
-    return "No photos that have a place were matched with each other."
+    return _none(report["pairs"]) or "No photos that have a place were matched with each other."
 
 
 def _told_pairs(report: dict[str, Any]) -> str:

@@ -58,6 +58,11 @@ def test_a_plan_is_told_in_figures_and_in_words(plan: Path, cli: Cli):
     assert "what more would gain" in out and "more control points, where they help most:" not in out
 
 
+@pytest.fixture(autouse=True)
+def _own_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jaxba.cli._plan.use_compilation_cache", lambda: None)  # the tests' own stays
+
+
 def test_a_project_is_told_from_its_own_adjustment(made: Survey, cli: Cli):
     """Cameras are known as its adjustment says, whose sigmas the exported tile has."""
     code, out, _ = cli("plan", str(made.project), "--json")
@@ -73,7 +78,7 @@ def test_an_example_is_a_plan(tmp_path: Path, cli: Cli):
     code, out, _ = cli("plan", "--example")
     assert code == 0
     path = tmp_path / "flight.toml"
-    path.write_text(out.replace("height_m = 100.0", "height_m = 5.0"))
+    path.write_text(out.replace("height_m = 100.0", "height_m = 15.0"))
     code, _, err = cli("plan", str(path))
     assert code == 2 and "fly higher (flight.height_m)" in err
 
@@ -82,6 +87,8 @@ def test_what_is_no_plan_is_refused(tmp_path: Path, cli: Cli):
     assert cli("plan")[0] == 2
     code, _, err = cli("plan", str(tmp_path))
     assert code == 2 and f"{tmp_path}: is a folder, and no project" in err
+    code, _, err = cli("plan", str(tmp_path), "--improve", "control", "--points", "50")
+    assert code == 2 and "--points 50: give from 1 to 40" in err
     code, out, _ = cli("plan", str(tmp_path / "none.toml"), "--json")
     assert code == 2 and json.loads(out)["exit_code"] == 2
 

@@ -13,6 +13,7 @@ from jaxba.cli._progress import overwritten
 from jaxba.cli._solve import tile_of
 from jaxba.cli._text import many, to_json, wrapped
 from jaxba.design import (
+    MOST_POINTS,
     Control,
     FlightPlan,
     Network,
@@ -26,6 +27,7 @@ from jaxba.design import (
     read_plan,
     stations_of,
 )
+from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.engine._project import is_project
 from jaxba.io import problem_of_bytes, read_bytes
 from jaxba.pipeline import PIPELINE
@@ -36,6 +38,9 @@ _LABEL, _NAME, _FIGURE = 11, 52, 11
 
 def run(what: Path, *, improve: str | None, points: int, as_json: bool, quiet: bool) -> int:
     """Tell what a plan or a project would give; return 0."""
+    if not 1 <= points <= MOST_POINTS:
+        raise JaxbaError(f"--points {points}: give from 1 to {MOST_POINTS} control points.")
+    use_compilation_cache()
     is_shown = sys.stderr.isatty() and not quiet and not as_json
     with overwritten() if is_shown else contextlib.nullcontext(lambda text: None) as say:
         say("laying out the block ...")
@@ -101,9 +106,12 @@ def _of_project(folder: Path) -> tuple[Network, Place, Control, dict[str, Any]]:
         network = network_of_block(held.problem, (width, height), done.adjust.mark_std_px, held.loss)
     except JaxbaError as error:
         raise JaxbaError(f"{folder}: {error}") from None
-    reference = done.crs.reference
-    is_placed = done.adjust.block.is_georeferenced and reference.frame is not None
-    place = Place(reference.frame) if is_placed else Place()
+    if not done.adjust.block.is_georeferenced:
+        raise JaxbaError(
+            f"{folder}: its block has no place and no scale to foretell sigmas in; give control points or photos with "
+            "positions, and run again."
+        )
+    place = Place(done.control.reference.frame)
     focal = float(np.median(done.adjust.block.camera_parameters[:, 0]))
     return network, place, Control(), {"control": int(done.control.control.num_points), "focal_px": focal}
 

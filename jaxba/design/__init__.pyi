@@ -4,7 +4,7 @@ from ._forecast import forecast as forecast, gains as gains, improved as improve
 from ._modes import Mode as Mode, dome_std_m as dome_std_m, shift_std_m as shift_std_m, weakest_modes as weakest_modes
 from ._network import Network as Network, Spots as Spots, spots_in as spots_in
 from ._place import Place as Place
-from ._placement import Placed as Placed, place_control as place_control
+from ._placement import MOST_POINTS as MOST_POINTS, Placed as Placed, place_control as place_control
 from ._planned import network_of as network_of
 from ._sections import Control as Control
 from ._stations import Stations as Stations, stations_of as stations_of

@@ -33,7 +33,8 @@ _POWER = 12  # of the variances: 24 of the sigmas
 _CANDIDATES = 13  # along the longer side of the area
 _LEAST_RAYS = 3.0  # of a place for a control point
 _STEPS, _FIRST_STEP, _SHRINK, _LAST_STEP = 60, 0.1, 0.6, 1e-3  # steps are shares of the area's extent
-_MOST_POINTS = 40
+MOST_POINTS = 40
+"""Control points that can be placed at once."""
 _STARTS = 3
 
 
@@ -79,8 +80,8 @@ def place_control(network: Network, count: int, std_m: tuple[float, float, float
 
     Raises `JaxbaError` where the count is none, or the photos see too little of the area.
     """
-    if not 1 <= count <= _MOST_POINTS:
-        raise JaxbaError(f"{count} control points to place; give from 1 to {_MOST_POINTS}.")
+    if not 1 <= count <= MOST_POINTS:
+        raise JaxbaError(f"{count} control points to place; give from 1 to {MOST_POINTS}.")
     given = _given(network, std_m)
     candidates = network.at(spots_in(network.area_m, _CANDIDATES))
     places = candidates.xyz_m[candidates.rays >= _LEAST_RAYS, :2]

@@ -13,7 +13,7 @@ from jaxba._errors import JaxbaError
 from jaxba.design._flight_plan import FlightPlan
 from jaxba.design._sections import Camera, Flight
 
-MOST_PHOTOS = 2000
+MOST_PHOTOS = 1000
 _SECOND_TURN_DEG = 90.0  # lines at a second height cross the first ones
 
 

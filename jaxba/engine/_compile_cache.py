@@ -12,6 +12,7 @@ import logging
 import os
 import platform
 import sys
+import warnings
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
@@ -27,8 +28,10 @@ def use_compilation_cache() -> None:
     """Switch the cache on for this process, in this machine's folder of `$XDG_CACHE_HOME/jaxba` or `~/.cache/jaxba`.
 
     jax's own environment variables, such as `JAX_COMPILATION_CACHE_DIR`, win. Without a folder that may be written to,
-    everything works, only slower.
+    everything works, only slower. An entry that another process is writing just now, or was killed over, cannot be
+    read: jax compiles anew then, and would warn of it.
     """
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry", UserWarning)
     settings = {
         "jax_persistent_cache_min_compile_time_secs": 0.0,
         "jax_persistent_cache_min_entry_size_bytes": -1,

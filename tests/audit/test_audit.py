@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Cli
-from models import FOCAL_PX, PLANTS, clean, control_list, with_camera_shifted, with_wrong_matches, written
 
+from benchmarks.audits import FOCAL_PX, PLANTS, clean, control_list, with_camera_shifted, with_wrong_matches, written
 from jaxba.audit import Audited, audit
 from jaxba.report.document import FIELDS, paths_of
 from jaxba.report.document._schema import SECTIONS_WITHOUT_DATA

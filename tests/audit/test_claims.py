@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from models import clean, written
 
+from benchmarks.audits import clean, written
 from jaxba.audit._claims import check_claims
 from jaxba.audit._faults import of_claims
 from jaxba.io import read_bal, read_reconstruction, write_tile

@@ -77,7 +77,7 @@ def test_oblique_photos_look_at_the_middle_and_a_second_height_is_flown_across()
     ("flight", "said"),
     [
         ({"height_m": 5.0, "forward_overlap": 0.97, "side_overlap": 0.97}, r"fly higher \(flight.height_m\)"),
-        ({"height_m": 5.0, "forward_overlap": 0.9, "side_overlap": 0.9}, r"the plan has \d+ photos, over 2000"),
+        ({"height_m": 10.0, "forward_overlap": 0.9, "side_overlap": 0.85}, r"the plan has \d+ photos, over 1000"),
     ],
 )
 def test_too_many_photos_are_refused(flight: dict[str, float], said: str):

@@ -1,3 +1,4 @@
+import os
 import re
 import subprocess
 import sys
@@ -69,3 +70,24 @@ def test_naming_the_folder_loads_no_jax():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.split() == []
+
+
+_COMPILE = """
+from jaxba.engine._compile_cache import use_compilation_cache
+use_compilation_cache()
+import jax
+print(float(jax.jit(lambda x: 2 * x + 1)(3.0)))
+"""
+
+
+def test_an_entry_that_was_cut_off_is_compiled_anew_without_a_word(tmp_path: Path):
+    """As a process leaves it that is killed while it writes, or that is still writing."""
+    env = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    env["XDG_CACHE_HOME"] = str(tmp_path)
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", _COMPILE], env=env, capture_output=True, text=True)
+        assert (done.stdout, done.stderr) == ("7.0\n", "")
+        entries = list(tmp_path.rglob("*-cache"))
+        assert entries
+        for entry in entries:
+            entry.write_bytes(entry.read_bytes()[:-20])

@@ -1,10 +1,18 @@
-"""A model of COLMAP's own making, clean or with one fault planted, for audits."""
+"""Does an audit name the fault of a model, and nothing else? `python -m benchmarks.audits --seeds 20`.
 
-from collections.abc import Callable
+Models of COLMAP's own making are audited clean, with one fault planted, with control points, and with two of these
+exchanged. A case is right where the planted fault is the only one that is named, and a clean model has none.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+
+from jaxba.audit import audit
 
 FOCAL_PX, SIZE_PX = 1280.0, (1024, 768)
 NOISE_PX = 0.5
@@ -89,3 +97,45 @@ def control_list(
                 other = dict([exchanged, exchanged[::-1]]).get(name, name)
                 rows.append("{:.4f} {:.4f} {:.4f} ".format(*surveyed[other]) + f"{x:.3f} {y:.3f} {image.name} {name}")
     return crs + "\n".join(rows) + "\n"
+
+
+_NAMED = {"focal": "intrinsics off", "camera": "images off", "matches": "wrong matches"}
+_WHAT = {
+    "clean": "no fault",
+    "focal": "focal length 5% too long",
+    "camera": "one camera shifted by a twentieth of the block",
+    "matches": "2% of the observations wrong",
+    "control": "eight control points, no fault",
+    "exchanged": "two control points exchanged",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.audits", description=__doc__)
+    parser.add_argument("--seeds", type=int, default=20)
+    options = parser.parse_args(arguments)
+    print("| planted | models | named alone |\n| --- | --- | --- |")
+    for case, what in _WHAT.items():
+        right = sum(is_right(case, seed) for seed in range(options.seeds))
+        print(f"| {what} | {options.seeds} | {right} |", flush=True)
+
+
+def is_right(case: str, seed: int) -> bool:
+    """Return whether the audit of a model names what was planted, and nothing else."""
+    model, gcp = clean(seed), None
+    if case in PLANTS:
+        PLANTS[case](model)
+        model.update_point_3d_errors()
+    expected = [_NAMED[case]] if case in _NAMED else []
+    with tempfile.TemporaryDirectory() as folder:
+        if case in ("control", "exchanged"):
+            gcp = Path(folder) / "gcp_list.txt"
+            exchanged = ("g1", "g5") if case == "exchanged" else ("", "")
+            gcp.write_text(control_list(model, exchanged=exchanged))
+            expected = ["control labels exchanged"] if case == "exchanged" else []
+        found = audit(written(Path(folder) / "model", model), Path(folder) / "audit", gcp=gcp)
+    return [fault.kind for fault in found.faults] == expected
+
+
+if __name__ == "__main__":
+    main()

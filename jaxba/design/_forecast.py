@@ -58,8 +58,8 @@ def gains(network: Network, control: Control, say: Callable[[str], None] = lambd
 
     - `control`: sigmas of more control points. `say`: told the name of each row before it is computed.
 
-    A row has `name`, `photos`, and where it could be computed `ground`, `shift_std_m`, `dome_std_m` and `focal_std_px`
-    as `forecast` has them, else `none`, the reason.
+    A row has `name`, and `photos`, `worst_std_m`, `median_std_m`, `dome_std_m` and `focal_std_px` as `forecast` has
+    them, or where it cannot be computed `none`, the reason.
     """
     ways: list[tuple[str, Callable[[], Network]]] = [("as it is", lambda: network)]
     ways.append(("with oblique photos around it", lambda: with_oblique(network)))

@@ -52,7 +52,7 @@ class Network:
             xyz_m, across, inverse, rays = (np.asarray(part) for part in _at(self.views, self.ground, plan_m))
         moved = across.reshape(-1, across.shape[2])
         joint = moved @ self.covariance @ moved.T
-        return Spots(xyz_m, rays, joint, self.mark_std_px**2 * inverse)
+        return Spots(xyz_m, rays, moved, joint, self.mark_std_px**2 * inverse)
 
     @property
     def focal_std_px(self) -> float:
@@ -76,12 +76,14 @@ class Spots:
     """Places of the ground, as a block would have them from marks in all photos that show them.
 
     - `xyz_m`: true places. `rays`: photos that show each, those at their edges in part.
+    - `across`: what poses and intrinsics do to each coordinate, as `camera_covariance` orders them.
     - `joint_m2`: covariance of all of them that errors of the block cause, east, north, up of each in turn.
     - `noise_m2`: what errors of its own marks add to each.
     """
 
     xyz_m: Float[np.ndarray, "spots 3"]
     rays: Float[np.ndarray, " spots"]
+    across: Float[np.ndarray, "coordinates unknowns"]
     joint_m2: Float[np.ndarray, "coordinates coordinates"]
     noise_m2: Float[np.ndarray, "spots 3 3"]
 

@@ -27,9 +27,9 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import fast_jit
 from jaxba.design._ground import Ground
 from jaxba.design._network import Network, spots_in
+from jaxba.design._on_grid import POWER, OnGrid
 from jaxba.design._views import Views
 
-_POWER = 12  # of the variances: 24 of the sigmas
 _CANDIDATES = 13  # along the longer side of the area
 _LEAST_RAYS = 3.0  # of a place for a control point
 _STEPS, _FIRST_STEP, _SHRINK, _LAST_STEP = 60, 0.1, 0.6, 1e-3  # steps are shares of the area's extent
@@ -84,10 +84,13 @@ def place_control(network: Network, count: int, std_m: tuple[float, float, float
         raise JaxbaError(f"{count} control points to place; give from 1 to {MOST_POINTS}.")
     given = _given(network, std_m)
     candidates = network.at(spots_in(network.area_m, _CANDIDATES))
-    places = candidates.xyz_m[candidates.rays >= _LEAST_RAYS, :2]
-    if not len(places):
+    seen = candidates.rays >= _LEAST_RAYS
+    if not seen.any():
         raise JaxbaError("no spot of the area is seen by three photos; overlap more, or fly over all of it.")
-    starts = [_exchanged(given, places, count), *(_spread(places, count, turn) for turn in range(_STARTS))]
+    candidates = network.at(candidates.xyz_m[seen, :2])
+    places = candidates.xyz_m[:, :2]
+    chosen = OnGrid(network, candidates, std_m).exchanged(count)
+    starts = [places[chosen], *(_spread(places, count, turn) for turn in range(_STARTS))]
     reached = [_descended(given, network.area_m, start) for start in starts]
     best = min(reached, key=lambda each: each.worst_m)
     before, after = (_std(given, plan_m) for plan_m in (np.zeros((0, 2)), best.plan_m))
@@ -100,25 +103,15 @@ def place_control(network: Network, count: int, std_m: tuple[float, float, float
 
 def _given(network: Network, std_m: Sequence[float]) -> _Given:
     spots = network.spots
-    with jax.enable_x64(True):
-        _, across, _ = network_rows(network.views, np.asarray(spots.xyz_m))
-    rows = np.asarray(across).reshape(len(spots.joint_m2), -1)
     return _Given(
         network.views,
         network.ground,
         network.covariance,
-        rows @ network.covariance,
+        spots.across @ network.covariance,
         spots.std_m.reshape(-1) ** 2,
         np.array(network.mark_std_px**2),
         np.array(std_m, float) ** 2,
     )
-
-
-@fast_jit
-def network_rows(views: Views, xyz_m: Array) -> tuple[Array, Array, Array]:
-    """Return the weight of the rays, what errors of the block do to spots, and N^-1; see `Views.spots`."""
-    across, inverse, rays = views.spots(xyz_m)
-    return rays, across, inverse
 
 
 def _variances(given: _Given, plan_m: Array) -> Array:
@@ -139,7 +132,7 @@ def _smooth_worst(given: _Given, plan_m: Array) -> tuple[Array, Array]:
     """Return nearly the largest sigma, and the largest itself."""
     variance = _variances(given, plan_m)
     most = jax.lax.stop_gradient(jnp.max(variance))
-    return jnp.sqrt(most * jnp.mean((variance / most) ** _POWER) ** (1 / _POWER)), jnp.sqrt(most)
+    return jnp.sqrt(most * jnp.mean((variance / most) ** POWER) ** (1 / POWER)), jnp.sqrt(most)
 
 
 @fast_jit
@@ -186,50 +179,6 @@ def _descended(given: _Given, area_m: Float[np.ndarray, "corners 2"], start: Flo
             else:
                 step *= _SHRINK
     return best
-
-
-def _exchanged(given: _Given, places: Float[np.ndarray, "places 2"], count: int) -> Float[np.ndarray, "points 2"]:
-    """Return the best places of a grid, one after the other, then exchanged until no exchange helps."""
-    update = _Update(given, places)
-    chosen: list[int] = []
-    for _ in range(count):
-        chosen.append(update.best(chosen))
-    for _ in range(3):
-        before = list(chosen)
-        for k in range(count):
-            chosen[k] = update.best(chosen[:k] + chosen[k + 1 :])
-        if chosen == before:
-            break
-    return places[chosen]
-
-
-class _Update:
-    """Sigmas with control points at some of many places, without computing these anew."""
-
-    def __init__(self, given: _Given, places: Float[np.ndarray, "places 2"]) -> None:
-        with jax.enable_x64(True):
-            _, across, inverse = network_rows(given.views, np.asarray(given.ground.at(places), float))
-        rows = np.asarray(across).reshape(3 * len(places), -1)
-        self.given, self.num = given, len(places)
-        self.mixed = np.asarray(given.across) @ rows.T
-        self.joint = rows @ np.asarray(given.covariance) @ rows.T
-        noise = float(given.mark_variance) * np.asarray(inverse) + np.diag(given.survey_variance)
-        for k, block in enumerate(noise):
-            self.joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
-
-    def best(self, chosen: Sequence[int]) -> int:
-        """Return the place that lowers nearly the largest sigma most beside those chosen."""
-        return int(np.argmin([self.value([*chosen, k]) if k not in chosen else np.inf for k in range(self.num)]))
-
-    def value(self, chosen: Sequence[int]) -> float:
-        """Return nearly the largest variance."""
-        variance = self.variances(chosen)
-        return float(variance.max() * np.mean((variance / variance.max()) ** _POWER) ** (1 / _POWER))
-
-    def variances(self, chosen: Sequence[int]) -> Float[np.ndarray, " coordinates"]:
-        columns = (3 * np.array(chosen)[:, None] + np.arange(3)).ravel()
-        half = np.linalg.solve(np.linalg.cholesky(self.joint[np.ix_(columns, columns)]), self.mixed[:, columns].T)
-        return np.asarray(self.given.variance) - np.sum(half**2, axis=0)
 
 
 def _spread(places: Float[np.ndarray, "places 2"], count: int, turn: int) -> Float[np.ndarray, "points 2"]:

@@ -13,7 +13,8 @@ from jaxba.ba import covariance
 from jaxba.design import network_of, place_control, spots_in, with_control
 from jaxba.design._modes import modes_of
 from jaxba.design._network import Spots
-from jaxba.design._placement import _given, _slope, _std, _Update
+from jaxba.design._on_grid import OnGrid
+from jaxba.design._placement import _given, _slope, _std
 from jaxba.design._sections import Gnss
 from jaxba.design._variants import with_oblique, with_positions, with_second_height
 
@@ -68,9 +69,8 @@ def test_placement_is_no_worse_than_the_best_of_all_placements_on_a_grid(kind: s
     network = small_network(kind)
     placed = place_control(network, 4, CONTROL_STD_M)
     given = _given(network, CONTROL_STD_M)
-    places = spots_in(AREA_M, 6)
-    update = _Update(given, places)
-    best = min(update.variances(chosen).max() for chosen in itertools.combinations(range(len(places)), 4)) ** 0.5
+    grid = OnGrid(network, network.at(spots_in(AREA_M, 6)), CONTROL_STD_M)
+    best = min(grid.variances(chosen).max() for chosen in itertools.combinations(range(grid.num), 4)) ** 0.5
     assert placed.worst_m <= 1.05 * best
     assert placed.worst_m == pytest.approx(_std(given, placed.plan_m).max())
     assert np.all(placed.without_m >= placed.worst_m)
@@ -96,7 +96,8 @@ def test_modes_are_named_by_their_shape():
     tilted[:, 2] = 0.02 * plan[:, 0] / 40.0
     shifted = np.tile([0.5, 0.0, 0.0], (len(plan), 1))
     joint = sum(np.outer(d.ravel(), d.ravel()) for d in (bent, tilted, shifted)) + 1e-10 * np.eye(3 * len(plan))
-    modes = modes_of(Spots(xyz, np.full(len(plan), 9.0), joint, np.zeros((len(plan), 3, 3))))
+    nothing = np.zeros((len(plan), 3, 3))
+    modes = modes_of(Spots(xyz, np.full(len(plan), 9.0), np.zeros((len(joint), 1)), joint, nothing))
     assert [mode.name for mode in modes[:2]] == ["dome", "tilt"]
     up = [modes[0].corners_m[2], modes[0].middle_m[2]]
     assert up[0] - up[1] == pytest.approx(0.05, rel=0.02)

@@ -88,7 +88,7 @@ def test_every_parameter_reaches_the_rounds(simulated: Simulated, monkeypatch: p
     with pytest.raises(Reached) as reached:
         adjust.run(inputs, Params(**changed, min_angle=3.0))
     settings = vars(reached.value.args[0])
-    assert settings == changed | {"min_angle_rad": pytest.approx(np.pi / 60)}
+    assert settings == changed | {"min_angle_rad": pytest.approx(np.pi / 60), "held": ()}
 
 
 def test_parameters_out_of_range_are_refused() -> None:

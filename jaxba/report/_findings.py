@@ -16,7 +16,7 @@ from jaxba.scene import Finding
 
 _MOST_NAMES = 10
 _MOST_ROWS = 8
-_TO_KNOW = ("edges left out", "common offset", "scale by bars", "audit note")
+_TO_KNOW = ("edges left out", "common offset", "scale by bars", "height datum assumed", "audit note")
 _DATUMS = {"ellipsoidal": "the WGS 84 ellipsoid", "mean_sea_level": "mean sea level (no geoid named)"}
 _TURNS = {1: "a quarter turn", 2: "half a turn", 3: "a quarter turn"}
 _LOOKS = {

@@ -492,7 +492,7 @@ def test_what_is_not_known_is_left_out_of_a_sentence(finding: Finding, words: st
 
 def test_what_was_done_is_told_apart_from_what_asks_for_something():
     kinds = {finding.kind for finding, _ in CASES if not is_to_act_on(finding)}
-    assert kinds == {"edges left out", "common offset", "scale by bars", "audit note"}
+    assert kinds == {"edges left out", "common offset", "scale by bars", "height datum assumed", "audit note"}
 
 
 def test_more_than_ten_photos_are_counted():

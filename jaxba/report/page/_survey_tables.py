@@ -14,7 +14,7 @@ def sigma_blocks(found: dict[str, Any]) -> list[Table | str]:
         for what, key in (("camera", "camera_m"), ("point", "point_m"))
     ]
     rows.append(["absolute accuracy of a point", *(found["absolute_m"] or ["not known"] * 3)])
-    told = f"Absolute accuracy: {found['absolute_text'][0].lower()}{found['absolute_text'][1:]}"
+    told = f"Absolute accuracy: {found['absolute_text']}"
     return [found["text"], table("Sigmas and absolute accuracy", [text("figure"), *along("")], rows, note=told)]
 
 

@@ -69,14 +69,23 @@ def modes_of(spots: Spots) -> tuple[Mode, ...]:
 
 def shift_std_m(network: Network) -> Float[np.ndarray, "3"]:
     """Return the sigma of what the whole area is off in common, east, north, up, metres."""
-    joint = network.at(spots_in(network.area_m, _GRID)).joint_m2
+    return shift_of(network.at(spots_in(network.area_m, _GRID)))
+
+
+def shift_of(spots: Spots) -> Float[np.ndarray, "3"]:
+    """Return the sigma of the mean displacement of spots, east, north, up, metres."""
+    joint = spots.joint_m2
     count = len(joint) // 3
     return np.sqrt(np.einsum("niki->i", joint.reshape(count, 3, count, 3))) / count
 
 
 def dome_std_m(network: Network) -> float:
     """Return the sigma of the height of the area's middle against its corners that a dome alone makes, metres."""
-    spots = network.at(spots_in(network.area_m, _GRID))
+    return dome_of(network.at(spots_in(network.area_m, _GRID)))
+
+
+def dome_of(spots: Spots) -> float:
+    """Return the same of spots over an area."""
     dome = _shapes(spots.xyz_m)["dome"][:, 0]
     far, near = _ends(spots.xyz_m)
     up = dome.reshape(-1, 3)[:, 2]

@@ -15,7 +15,6 @@ from jaxba._errors import JaxbaError
 from jaxba.ba import (
     AbstractPrior,
     AspectPrior,
-    ControlPointPrior,
     IntrinsicsPrior,
     Observations,
     PositionOffsetPrior,
@@ -26,7 +25,7 @@ from jaxba.ba import (
 from jaxba.design._ground import Ground
 from jaxba.design._sections import Gnss, Ties
 from jaxba.geometry import AbstractCamera, Pose
-from jaxba.simulation import Images, field_of_view, make_tracks
+from jaxba.simulation import Images, Tracks, field_of_view, make_tracks
 
 _MOST_TILT = 2.75  # horizontal over vertical, 70 degrees: beyond it ground is too flat in view to match
 _FOCAL_STD, _CENTER_STD, _K_STD, _P_STD, _ASPECT_STD = 0.05, 0.01, 0.2, 0.01, 5e-4  # known of a camera beforehand
@@ -80,35 +79,28 @@ class Photos:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Targets:
-    """Control points on the ground: where they lie, sigmas of their coordinates, and of a mark in a photo."""
-
-    xyz_m: Float[np.ndarray, "points 3"]
-    std_m: tuple[float, float, float]
-    mark_std_px: float
-
-
-def problem_of(photos: Photos, ground: Ground, ties: Ties, gnss: Gnss, targets: Targets, *, seed: int = 0) -> Problem:
-    """Return what the adjustment of a block would be, all of it at its true values; control points come first.
+def problem_of(photos: Photos, ground: Ground, ties: Ties, gnss: Gnss, *, seed: int = 0) -> Problem:
+    """Return what the adjustment of a block without control points would be, all of it at its true values.
 
     Raises `JaxbaError` where the photos see too little, or the block falls into parts.
     """
-    points, observations = _observed(photos, ground, ties, targets, np.random.default_rng(seed))
+    tracks = _tie_points(photos, ground, ties, np.random.default_rng(seed))
     every = np.arange(photos.num, dtype=np.int32)
     priors: list[AbstractPrior] = [
         PositionPrior(image_index=every, xyz=photos.center_m, std_m=np.tile(gnss.std_m, (photos.num, 1))),
         *_of_cameras(photos),
     ]
-    count = len(targets.xyz_m)
-    if count:
-        std_m = np.tile(targets.std_m, (count, 1))
-        priors.append(ControlPointPrior(point_index=np.arange(count, dtype=np.int32), xyz=targets.xyz_m, std_m=std_m))
     has_offset = max(gnss.common_std_m) > 0
     if has_offset:
         priors.append(PositionOffsetPrior(xyz=np.zeros((1, 3)), std_m=np.maximum([gnss.common_std_m], 1e-6)))
+    observations = Observations(
+        tracks.xy_px,
+        np.full(len(tracks.xy_px), ties.std_px),
+        tracks.image_index.astype(np.int32),
+        tracks.point_index.astype(np.int32),
+    )
     problem = Problem.build(
-        photos.poses, photos.cameras, points, observations, camera_index=photos.camera_index, priors=priors
+        photos.poses, photos.cameras, tracks.points, observations, camera_index=photos.camera_index, priors=priors
     )
     if "k3" in photos.cameras.parameter_names():
         problem = problem.fix(intrinsics=["k3"])
@@ -118,11 +110,7 @@ def problem_of(photos: Photos, ground: Ground, ties: Ties, gnss: Gnss, targets: 
     return problem
 
 
-def _observed(
-    photos: Photos, ground: Ground, ties: Ties, targets: Targets, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "points 3"], Observations]:
-    """Return the points, targets first, and where photos see them, ordered by point."""
-
+def _tie_points(photos: Photos, ground: Ground, ties: Ties, rng: np.random.Generator) -> Tracks:
     def terrain(plan_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         return np.asarray(ground.at(plan_m), float)[:, 2]
 
@@ -134,7 +122,7 @@ def _observed(
         photos.center_m, photos.cam_from_world, photos.cameras, photos.camera_index, photos.frame_px, 0.0, photos.view
     )
     try:
-        tracks = make_tracks(
+        return make_tracks(
             rng,
             images,
             terrain,
@@ -146,22 +134,6 @@ def _observed(
         )
     except JaxbaError as error:
         raise JaxbaError(f"the photos would not make a block: {error}") from None
-    image, target, marked = marks(photos, targets.xyz_m)
-    seen = np.bincount(target, minlength=len(targets.xyz_m))
-    if (seen < 2).any():
-        bad = int(np.argmax(seen < 2))
-        east, north, _ = targets.xyz_m[bad]
-        raise JaxbaError(
-            f"control point {bad + 1}, {east:.0f} m east and {north:.0f} m north of the area's middle, is seen in "
-            f"{seen[bad]} photos, fewer than 2; move it into the area, or overlap more."
-        )
-    count = len(targets.xyz_m)
-    return np.concatenate([targets.xyz_m, tracks.points]), Observations(
-        np.concatenate([marked, tracks.xy_px]),
-        np.concatenate([np.full(len(image), targets.mark_std_px), np.full(len(tracks.xy_px), ties.std_px)]),
-        np.concatenate([image, tracks.image_index]).astype(np.int32),
-        np.concatenate([target, count + tracks.point_index]).astype(np.int32),
-    )
 
 
 def marks(

@@ -6,8 +6,9 @@ from scipy.spatial.transform import Rotation
 from jaxba.design._flight_plan import FlightPlan
 from jaxba.design._ground import Ground, ground_of_terrain
 from jaxba.design._network import Network
-from jaxba.design._photos import Photos, Targets, problem_of
+from jaxba.design._photos import Photos, problem_of
 from jaxba.design._stations import Stations, stations_of
+from jaxba.design._variants import with_control
 from jaxba.geometry import OpenCV
 from jaxba.simulation import smooth_terrain
 
@@ -21,9 +22,12 @@ def network_of(plan: FlightPlan) -> Network:
     Raises `JaxbaError` where it makes no block.
     """
     photos, ground = photos_of(plan, stations_of(plan))
-    targets = targets_of(plan, ground)
-    problem = problem_of(photos, ground, plan.ties, plan.gnss, targets, seed=_SEED)
-    return Network(photos, ground, problem, plan.area_m, plan.control.mark_std_px)
+    problem = problem_of(photos, ground, plan.ties, plan.gnss, seed=_SEED)
+    network = Network(photos, ground, problem, plan.area_m, plan.control.mark_std_px)
+    if not len(plan.control_m):
+        return network
+    control = plan.control
+    return with_control(network, plan.control_m, (control.std_h_m, control.std_h_m, control.std_v_m))
 
 
 def photos_of(plan: FlightPlan, stations: Stations) -> tuple[Photos, Ground]:
@@ -46,10 +50,3 @@ def photos_of(plan: FlightPlan, stations: Stations) -> tuple[Photos, Ground]:
     reach = 2 * plan.flight.height_m
     low, high = stations.center_m[:, :2].min(axis=0) - reach, stations.center_m[:, :2].max(axis=0) + reach
     return photos, ground_of_terrain(terrain, low, high)
-
-
-def targets_of(plan: FlightPlan, ground: Ground) -> Targets:
-    """Return the plan's control points on the ground."""
-    control = plan.control
-    xyz_m = np.asarray(ground.at(plan.control_m), float)
-    return Targets(xyz_m, (control.std_h_m, control.std_h_m, control.std_v_m), control.mark_std_px)

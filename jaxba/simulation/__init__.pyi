@@ -2,6 +2,7 @@ from . import photos as photos, synthetic as synthetic
 from ._flight import (
     Images as Images,
     Terrain as Terrain,
+    Tracks as Tracks,
     field_of_view as field_of_view,
     flight_plan as flight_plan,
     make_tracks as make_tracks,

@@ -11,7 +11,7 @@ from benchmarks.plans import compare
 from jaxba._errors import JaxbaError
 from jaxba.ba import covariance
 from jaxba.design import network_of, place_control, spots_in, with_control
-from jaxba.design._modes import modes_of
+from jaxba.design._modes import dome_of, modes_of, shift_of
 from jaxba.design._network import Spots
 from jaxba.design._on_grid import OnGrid
 from jaxba.design._placement import _given, _slope, _std
@@ -97,8 +97,11 @@ def test_modes_are_named_by_their_shape():
     shifted = np.tile([0.5, 0.0, 0.0], (len(plan), 1))
     joint = sum(np.outer(d.ravel(), d.ravel()) for d in (bent, tilted, shifted)) + 1e-10 * np.eye(3 * len(plan))
     nothing = np.zeros((len(plan), 3, 3))
-    modes = modes_of(Spots(xyz, np.full(len(plan), 9.0), np.zeros((len(joint), 1)), joint, nothing))
+    spots = Spots(xyz, np.full(len(plan), 9.0), np.zeros((len(joint), 1)), joint, nothing)
+    modes = modes_of(spots)
     assert [mode.name for mode in modes[:2]] == ["dome", "tilt"]
+    assert dome_of(spots) == pytest.approx(0.05, rel=1e-3)
+    np.testing.assert_allclose(shift_of(spots), [0.5, 0.0, 0.0], atol=1e-5)
     up = [modes[0].corners_m[2], modes[0].middle_m[2]]
     assert up[0] - up[1] == pytest.approx(0.05, rel=0.02)
     assert modes[1].corners_m[2] == pytest.approx(0.02, rel=0.02)

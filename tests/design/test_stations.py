@@ -43,8 +43,9 @@ def test_neighbours_overlap_as_planned_and_lines_go_to_and_fro():
     seen = footprints(plan, stations)
     first, second = seen[0], seen[1]
     assert first.intersection(second).area / first.area == pytest.approx(0.65)
-    per_line = len(seen) // stations.num_lines
-    assert seen[per_line // 2].intersection(seen[-per_line + per_line // 2]).area < first.area
+    across = np.diff(np.unique(stations.center_m[:, 0].round(6)))
+    width = plan.flight.height_m * plan.camera.width_px / plan.camera.focal
+    np.testing.assert_allclose(across, width * (1 - plan.flight.side_overlap), atol=1e-5)
     ahead = -stations.cam_from_world[:, 1, :2]
     moved = np.diff(stations.center_m[:, :2], axis=0)
     along = np.einsum("ni,ni->n", moved, ahead[:-1]) / np.linalg.norm(moved, axis=1)

@@ -5,11 +5,6 @@ from ._bal import (
 )
 from ._bars import BAR_COLUMNS as BAR_COLUMNS, MeasuredBar as MeasuredBar, parse_bars as parse_bars
 from ._cloud import Cloud as Cloud
-from ._colmap import (
-    write_colmap_binary as write_colmap_binary,
-    write_colmap_text as write_colmap_text,
-)
-from ._colmap_model import ColmapModel as ColmapModel
 from ._crs import CrsText as CrsText
 from ._csv_bars import (
     BAR_RESULT_COLUMNS as BAR_RESULT_COLUMNS,
@@ -44,14 +39,9 @@ from ._geotag_match import (
 from ._geotags import Geotag as Geotag, Geotags as Geotags, parse_geotags as parse_geotags
 from ._las import write_las as write_las
 from ._list_cells import without_fillers as without_fillers
-from ._opensfm import write_opensfm as write_opensfm
 from ._ply import write_ply as write_ply
 from ._problem import problem_of_bytes as problem_of_bytes, read_problem as read_problem
 from ._read import read_bytes as read_bytes, text_of as text_of
-from ._read_colmap import read_colmap as read_colmap, read_colmap_text as read_colmap_text
-from ._read_colmap_binary import read_colmap_binary as read_colmap_binary
-from ._read_opensfm import read_opensfm as read_opensfm
-from ._reconstruction import read_reconstruction as read_reconstruction
 from ._schema import SCHEMA as SCHEMA, schema_markdown as schema_markdown
 from ._sites import (
     SITE_COLUMNS as SITE_COLUMNS,
@@ -69,3 +59,13 @@ from ._tiles import (
     solved_before as solved_before,
     write_tiles as write_tiles,
 )
+from .models._colmap import (
+    write_colmap_binary as write_colmap_binary,
+    write_colmap_text as write_colmap_text,
+)
+from .models._colmap_model import ColmapModel as ColmapModel
+from .models._opensfm import write_opensfm as write_opensfm
+from .models._read_colmap import read_colmap as read_colmap, read_colmap_text as read_colmap_text
+from .models._read_colmap_binary import read_colmap_binary as read_colmap_binary
+from .models._read_opensfm import read_opensfm as read_opensfm
+from .models._reconstruction import read_reconstruction as read_reconstruction

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.io._colmap_lines import Damage, unit
+from jaxba.io.models._colmap_lines import Damage, unit
 from jaxba.scene import Block, Claim
 
 PARAMETERS = {

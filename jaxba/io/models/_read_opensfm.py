@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
-from jaxba.io._opensfm_cameras import OpensfmCameras
-from jaxba.io._opensfm_fields import is_number, numbers, told
-from jaxba.io._opensfm_tracks import read_tracks
 from jaxba.io._read import read_bytes, text_of
+from jaxba.io.models._opensfm_cameras import OpensfmCameras
+from jaxba.io.models._opensfm_fields import is_number, numbers, told
+from jaxba.io.models._opensfm_tracks import read_tracks
 from jaxba.scene import Block, Reconstruction
 
 _POSE = "rotation", "translation"

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxba._errors import JaxbaError
-from jaxba.io._colmap_lines import Damage, claim, content_lines, finite, unit
-from jaxba.io._colmap_model import ColmapImage
+from jaxba.io.models._colmap_lines import Damage, claim, content_lines, finite, unit
+from jaxba.io.models._colmap_model import ColmapImage
 
 _TOLERANCE = 1e-5  # rad, and of a translation's length: texts of six digits round by a tenth of it
 CAMERA = "CAMERA"

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from jaxba._errors import JaxbaError
-from jaxba.io._colmap_lines import Damage, claim, comment_lines, content_lines, finite
-from jaxba.io._colmap_model import (
+from jaxba.io.models._colmap_lines import Damage, claim, comment_lines, content_lines, finite
+from jaxba.io.models._colmap_model import (
     PARAMETERS,
     ColmapCamera,
     ColmapFiles,
@@ -24,8 +24,8 @@ from jaxba.io._colmap_model import (
     check_one_model,
     model_of,
 )
-from jaxba.io._colmap_rigs import read_rigs_text, refuse_other_poses
-from jaxba.io._read_colmap_binary import read_colmap_binary
+from jaxba.io.models._colmap_rigs import read_rigs_text, refuse_other_poses
+from jaxba.io.models._read_colmap_binary import read_colmap_binary
 from jaxba.scene import Claim
 
 _HEADER = re.compile(r"# Number of (cameras|images|points): (\d+)(?:, (mean [a-z ]+): (\S+))?")

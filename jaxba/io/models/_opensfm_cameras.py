@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba._errors import JaxbaError
-from jaxba.io._opensfm_fields import number, told
+from jaxba.io.models._opensfm_fields import number, told
 
 _FISHEYE = "fisheye_opencv", "fisheye"
 _LONGEST_PX = 1e7

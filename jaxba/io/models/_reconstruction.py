@@ -15,12 +15,12 @@ from jaxtyping import Int
 from jaxba._errors import JaxbaError
 from jaxba.ba import Problem
 from jaxba.geometry import BAL, CAMERAS
-from jaxba.io._colmap_model import ColmapFiles
 from jaxba.io._npz import ZIP_MAGIC
 from jaxba.io._problem import problem_of_bytes
 from jaxba.io._read import read_bytes
-from jaxba.io._read_colmap import read_colmap
-from jaxba.io._read_opensfm import read_opensfm
+from jaxba.io.models._colmap_model import ColmapFiles
+from jaxba.io.models._read_colmap import read_colmap
+from jaxba.io.models._read_opensfm import read_opensfm
 from jaxba.scene import Block, Reconstruction
 
 _GREY = 128

@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxba._errors import JaxbaError
-from jaxba.io._colmap_lines import claim
-from jaxba.io._colmap_model import (
+from jaxba.io._read import read_bytes
+from jaxba.io.models._colmap_lines import claim
+from jaxba.io.models._colmap_model import (
     NO_POINT,
     PARAMETERS,
     ColmapCamera,
@@ -35,8 +36,7 @@ from jaxba.io._colmap_model import (
     check_one_model,
     model_of,
 )
-from jaxba.io._colmap_rigs import CAMERA, Frame, Rigs, Transform, refuse_other_poses, rigs_files, transform_of
-from jaxba.io._read import read_bytes
+from jaxba.io.models._colmap_rigs import CAMERA, Frame, Rigs, Transform, refuse_other_poses, rigs_files, transform_of
 
 _MODELS = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",

@@ -16,15 +16,13 @@ import logging
 import platform
 import queue
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.engine._compile_cache import use_compilation_cache
 from jaxba.engine._items import Ended, Item, called, late
 from jaxba.engine._versions import installed
 from jaxba.engine._workers import Resources
@@ -37,7 +35,6 @@ except ImportError as error:
 _ANSWER_S = 10.0  # for a scheduler to answer
 _PATIENCE_S = 60.0  # for workers to be there
 _LOOK_S = 0.5
-_KEPT_SHARE, _UNLIMITED = 0.5, 4e9  # of a worker's memory; bytes, where none is said
 _HEAD = 65536  # bytes of a file that tell it from others
 
 
@@ -67,46 +64,6 @@ def cluster(reads: Iterable[Path], resources: Resources) -> Iterator["Cluster"]:
         if client is not None:
             client.close()
         logger.setLevel(level)
-
-
-@contextlib.contextmanager
-def crew(resources: Resources, reads: Iterable[Path]) -> Iterator[tuple[list[Executor], float]]:
-    """Yield an executor a thread of each worker, and the bytes that each may keep of what it works on."""
-    with cluster(reads, resources) as engine:
-        workers = engine.workers()
-        least = min(worker["memory_limit"] or _UNLIMITED for worker in workers.values())
-        try:
-            threads = _free(workers, (), alone=False)
-            yield [_OfWorker(engine.client, address) for address in threads], _KEPT_SHARE * least
-        except JaxbaError:
-            engine.workers()  # says so where it is the scheduler, or the last worker, that has gone
-            raise
-
-
-class _OfWorker(Executor):
-    """Gives work to a worker, and to others like it where that one has gone."""
-
-    def __init__(self, client: distributed.Client, address: str) -> None:
-        self._inner = client.get_executor(workers=[address], allow_other_workers=True, pure=False)
-        self._versions = _versions()
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return the future of a call; raise `BrokenExecutor` where the scheduler has gone."""
-        try:
-            return self._inner.submit(_where_alike, self._versions, fn, *args, **kwargs)
-        except (OSError, RuntimeError) as error:
-            raise BrokenExecutor(str(error)) from error
-
-
-def _where_alike(versions: dict[str, str], fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Call in a worker, which may have come after the others were compared."""
-    if other := _difference(versions, _versions()):
-        raise JaxbaError(f"a worker on {platform.node()}: {other}")
-    use_compilation_cache()
-    try:
-        return fn(*args, **kwargs)
-    except JaxbaError as error:
-        raise JaxbaError(f"{error} (on a worker of {platform.node()})") from error
 
 
 class Cluster:
@@ -280,12 +237,17 @@ def _seen(paths: list[str]) -> dict[str, str | None]:
     return found
 
 
+def threads_of(workers: dict[str, Any]) -> list[str]:
+    """Return the address of each thread."""
+    return [address for address, worker in workers.items() for _ in range(worker["nthreads"])]
+
+
 def _free(workers: dict[str, Any], given: Any, *, alone: bool) -> list[str]:
     """Return the address of each thread that nothing was given to; of one, where no other item is worked on."""
-    busy = [one.address for one in given]
+    busy = Counter(one.address for one in given)
     if alone:
         return [] if busy else list(workers)[:1]
-    return [address for address, worker in workers.items() for _ in range(worker["nthreads"] - busy.count(address))]
+    return list((Counter(threads_of(workers)) - busy).elements())
 
 
 def _ended(future: distributed.Future, one: _Given) -> Ended:

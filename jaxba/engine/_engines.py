@@ -57,9 +57,9 @@ def crew(resources: Resources, reads: Sequence[Path]) -> Iterator[Crew | None]:
     if not resources.is_cluster:
         yield None
         return
-    from jaxba.engine import _cluster
+    from jaxba.engine import _crew
 
-    with _cluster.crew(resources, reads) as (executors, memory_bytes):
+    with _crew.crew(resources, reads) as (executors, memory_bytes):
         yield Crew(executors, memory_bytes)
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
@@ -160,21 +161,49 @@ def test_a_scheduler_that_goes_or_has_no_worker_is_named(tmp_path: Path, monkeyp
                 list(ending)
 
 
-def test_a_crew_works_where_it_is_alike(scheduler: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_crew_has_an_executor_a_thread(scheduler: Path):
     with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
         assert found is not None and len(found.executors) == 2 and 1e8 < found.memory_bytes < 1e12
         assert [executor.submit(double, k).result() for k, executor in enumerate(found.executors)] == [0, 2]
         with pytest.raises(JaxbaError, match=r"disk full \(on a worker of "):
             found.executors[0].submit(double, 16).result()
-        monkeypatch.setattr(_cluster, "_versions", lambda: {"jaxba": "0"})
-        with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
-            executor = _cluster._OfWorker(client, "tcp://127.0.0.1:9")  # which is not there: another one does it
-            future = executor.submit(double, 1)
-            assert isinstance(future.exception(30), JaxbaError)
-        with pytest.raises(JaxbaError, match=r"a worker on .*: it has .*, and this process has .*; results would"):
-            future.result()
     with crew(Resources(), ()) as none:
         assert none is None
+
+
+def kill(scheduler: Path, count: int) -> list[int]:
+    """Kill as many workers as are asked for, once they are there; return their processes' numbers."""
+    with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=60)
+        killed = sorted(client.run(os.getpid).values())[:count]
+    for pid in killed:
+        os.kill(pid, signal.SIGKILL)
+    return killed
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_crew_whose_workers_are_lost_works_with_those_that_come(scheduler: Path, count: int):
+    with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
+        assert found is not None
+        given = [executor.submit(double_slowly, k) for k, executor in enumerate(4 * found.executors)]
+        killed = kill(scheduler, count)
+        assert [future.result(90) for future in given] == [2 * k for k in range(8)]
+        # a thread each again, once the workers are there again
+        with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+        pids = {executor.submit(os.getpid).result(90) for executor in found.executors}
+        assert len(pids) == 2 and not pids & set(killed)
+
+
+def test_a_crew_says_what_to_do_where_a_call_ends_its_workers(scheduler: Path):
+    with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
+        assert found is not None
+        with pytest.raises(JaxbaError, match=r"end on the same piece of work \(3 in a row, .*Raise the --memory-limit"):
+            found.executors[0].submit(double, 13).result()
+        given = found.executors[0].submit(double_slowly, 1)
+        assert given.cancel()
+        with pytest.raises(CancelledError):
+            given.result()
 
 
 def test_tiles_whose_scheduler_goes_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -202,16 +231,10 @@ def test_a_run_on_a_cluster_makes_the_same_bytes_though_workers_are_killed(
 ):
     killed: set[int] = set()
 
-    def kill() -> None:
-        with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
-            pid = min(client.run(os.getpid).values())
-        os.kill(pid, signal.SIGKILL)
-        killed.add(pid)
-
     def kill_in_stage(event: Any) -> None:
         """Kill a worker in the middle of features, and one in the middle of matching."""
         if event.kind == "photo" and event.done == 2:
-            kill()
+            killed.update(kill(scheduler, 1))
 
     def in_tiles(survey: Survey, *changes: str, tell: Callable[[Event], None] = lambda event: None) -> Run:
         """Run two rounds with tiles of three photos, which are fewer than may be asked for."""
@@ -226,7 +249,7 @@ def test_a_run_on_a_cluster_makes_the_same_bytes_though_workers_are_killed(
     def kill_in_tile(told: _rounds._Told, done: int, total: int) -> None:
         tile(told, done, total)
         if (told.round, told.num_steps, done, total) == (2, 1, 4, 6):
-            kill()
+            killed.update(kill(scheduler, 1))
 
     monkeypatch.setattr(_rounds._Told, "tile", kill_in_tile)
     own = Survey(photos, tmp_path / "project")

@@ -22,18 +22,17 @@ from jaxba.scene import (
     Photo,
     Reference,
     ViewGraph,
-    described,
 )
 from jaxba.vision import (
     Descriptors,
+    PairMatches,
+    PairOptions,
     Pinhole,
     PosePrior,
-    TwoView,
-    common_ground,
+    View,
     grid_coverage,
-    match_descriptors,
+    match_pair,
     prepare_descriptors,
-    verify,
 )
 
 _ATTITUDE_STD_RAD = 0.05  # where the reference states none
@@ -180,47 +179,46 @@ def _matched(
 ) -> tuple[ViewGraph, PairRecord]:
     """Return the view graph of one pair, matched by features of one kind, and how it was verified."""
     first, second = inputs.photos[inputs.image], inputs.photos[partner]
-    matches, distinctiveness, odd = _matches(
-        features, prepared, others, first, second, params.ratio, may_be_apart=not np.isfinite(overlap)
-    )
-    notes += [LeftOut(name=f"{first.name}, {second.name}", reason=note) for note in odd]
     threshold_px = float(params.ransac_threshold or _threshold_px(first, second, overlap))
-    two_view = verify(
-        features.xy_px[matches[:, 0]],
-        others.xy_px[matches[:, 1]],
-        _pinhole(first),
-        _pinhole(second),
+    options = PairOptions(
+        ratio=params.ratio,
         threshold_px=threshold_px,
         epipolar_threshold_px=None if params.epipolar_threshold is None else float(params.epipolar_threshold),
         confidence=float(params.confidence),
         min_inliers=params.min_inliers,
-        prior=_prior(inputs.reference, inputs.image, partner),
     )
-    inliers = matches[two_view.is_inlier]
+    found = match_pair(
+        View(xy_px=features.xy_px, descriptors=prepared, pinhole=_pinhole(first)),
+        View(xy_px=others.xy_px, descriptors=prepare_descriptors(others), pinhole=_pinhole(second)),
+        options,
+        _prior(inputs.reference, inputs.image, partner),
+    )
+    notes += [LeftOut(name=f"{first.name}, {second.name}", reason=note) for note in found.notes]
+    inliers = found.matches[found.two_view.is_inlier]
     coverage = min(
         grid_coverage(features.xy_px[inliers[:, 0]], first.width_px, first.height_px),
         grid_coverage(others.xy_px[inliers[:, 1]], second.width_px, second.height_px),
     )
-    missed = _missed(len(matches), two_view, params)
+    missed = _missed(found, params)
     record = PairRecord.of(
         threshold_px=threshold_px,
-        model=Model[two_view.model.upper()],
+        model=Model[found.two_view.model.upper()],
         missed=missed,
-        num_verified=two_view.num_explained,
+        num_verified=found.two_view.num_explained,
     )
-    return _edge(inputs.image, partner, matches, distinctiveness, coverage, two_view, missed), record
+    return _edge(inputs.image, partner, found, coverage, missed), record
 
 
-def _missed(num_matches: int, two_view: TwoView, params: Params) -> Missed:
+def _missed(found: PairMatches, params: Params) -> Missed:
     """Return the first figure that a pair misses."""
-    num_inliers = int(two_view.is_inlier.sum())
-    if num_matches < params.min_inliers:
+    num_inliers = found.two_view.num_inliers
+    if found.num_putative < params.min_inliers:
         return Missed.MATCHES
     if num_inliers < params.min_inliers:
         return Missed.VERIFIED
     if num_inliers < params.min_good:
         return Missed.MIN_GOOD
-    return Missed.NOTHING if num_inliers >= params.min_inlier_ratio * num_matches else Missed.MIN_INLIER_RATIO
+    return Missed.NOTHING if num_inliers >= params.min_inlier_ratio * found.num_putative else Missed.MIN_INLIER_RATIO
 
 
 def _may_fall_back(
@@ -237,54 +235,18 @@ def _may_fall_back(
     return (Fallback.TAKEN if gsd_m > params.fallback_gsd else Fallback.GSD_TOO_FINE), gsd_m
 
 
-def _matches(
-    features: Features,
-    prepared: Descriptors,
-    others: Features,
-    first: Photo,
-    second: Photo,
-    ratio: float,
-    *,
-    may_be_apart: bool,
-) -> tuple[Int[np.ndarray, "matches 2"], Float[np.ndarray, " matches"], tuple[str, ...]]:
-    """Return the matches of two photos, how distinct they are, and notes; none where they show different ground.
-
-    `may_be_apart`: nothing says that they overlap, so that the largest features alone may rule it out.
-    """
-    prepared_others = prepare_descriptors(others)
-    ground, notes = described(
-        "common ground",
-        lambda: common_ground(
-            prepared,
-            prepared_others,
-            features.xy_px,
-            others.xy_px,
-            (first.width_px, first.height_px),
-            (second.width_px, second.height_px),
-            ratio,
-        ),
-        None,
-    )
-    if ground is None:  # it only spares comparisons
-        return *match_descriptors(prepared, prepared_others, ratio), notes
-    if ground.is_apart and may_be_apart:
-        return np.zeros((0, 2), np.int64), np.zeros(0), notes
-    return *match_descriptors(prepared.take(ground.first), prepared_others.take(ground.second), ratio), notes
-
-
 def _edge(
     image: int,
     partner: int,
-    matches: Int[np.ndarray, "matches 2"],
-    distinctiveness: Float[np.ndarray, " matches"],
+    found: PairMatches,
     coverage: float,
-    two_view: TwoView,
     missed: Missed,
 ) -> ViewGraph:
     """Return the view graph of one pair."""
     from scipy.spatial.transform import Rotation
 
-    inliers = matches[two_view.is_inlier]
+    two_view = found.two_view
+    inliers = found.matches[two_view.is_inlier]
     status = EdgeStatus.REJECTED
     if missed not in (Missed.MATCHES, Missed.VERIFIED):
         status = EdgeStatus.GOOD if missed == Missed.NOTHING else EdgeStatus.WEAK
@@ -297,12 +259,12 @@ def _edge(
         status=np.array([status], np.uint8),
         offsets=np.array([0, len(inliers)], np.int64),
         matches=inliers.astype(np.int32),
-        num_putative=np.array([len(matches)], np.int32),
+        num_putative=np.array([found.num_putative], np.int32),
         is_planar=np.array([two_view.is_planar]),
         quaternion=quaternion[None],
         direction=two_view.direction[None],
         residual_px=np.array([two_view.residual_px]),
-        distinctiveness=np.array([np.median(distinctiveness[two_view.is_inlier]) if len(inliers) else np.nan]),
+        distinctiveness=np.array([np.median(found.distinctiveness[two_view.is_inlier]) if len(inliers) else np.nan]),
         angle_rad=np.array([two_view.angle_rad]),
         coverage=np.array([coverage]),
     )

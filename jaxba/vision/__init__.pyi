@@ -14,6 +14,7 @@ from ._nearest import (
     prepare_descriptors as prepare_descriptors,
 )
 from ._overlap import common_ground as common_ground
+from ._pair import PairMatches as PairMatches, PairOptions as PairOptions, View as View, match_pair as match_pair
 from ._photo import (
     IMAGE_SUFFIXES as IMAGE_SUFFIXES,
     RAW_SUFFIXES as RAW_SUFFIXES,

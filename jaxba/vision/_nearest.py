@@ -44,6 +44,14 @@ class Descriptors:
         """Return some of them; matches still name features by their place among all."""
         return Descriptors(values=self.values[rows], is_binary=self.is_binary, first_index=self.first_index[rows])
 
+    def first(self, count: int) -> "Descriptors":
+        """Return as many of them."""
+        return self.take(np.arange(min(count, len(self.values))))
+
+    def distances(self, products: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the distances of descriptors whose products are given."""
+        return _hamming(products, self.values.shape[1]) if self.is_binary else _distance(products)
+
 
 def unit_descriptors(descriptors: UInt8[np.ndarray, "rows length"]) -> Float[np.ndarray, "rows length"]:
     """Return the square roots of SIFT descriptors that sum to 1, float32 of unit length.
@@ -68,7 +76,7 @@ def two_nearest(first: Float[np.ndarray, "rows length"], second: Float[np.ndarra
 def two_nearest_hamming(first: Float[np.ndarray, "rows bits"], second: Float[np.ndarray, "columns bits"]) -> Neighbours:
     """Return the same by Hamming distance of bits that are written as 1 and -1, float32."""
     index, best, next_best, is_mutual = _most_alike(first, second)
-    nearest, following = ((first.shape[1] - products.astype(np.float64)) / 2 for products in (best, next_best))
+    nearest, following = (_hamming(products, first.shape[1]) for products in (best, next_best))
     return Neighbours(index=index, nearest=nearest, second=following, is_mutual=is_mutual)
 
 
@@ -140,7 +148,16 @@ def match_descriptors(
     if min(len(first.values), len(second.values)) < 2:
         return np.zeros((0, 2), np.int64), np.zeros(0)
     search = two_nearest_hamming if first.is_binary else two_nearest
-    matches, distinctiveness = ratio_matches(search(first.values, second.values), ratio)
+    return one_of_a_position(first, second, *ratio_matches(search(first.values, second.values), ratio))
+
+
+def one_of_a_position(
+    first: Descriptors,
+    second: Descriptors,
+    matches: Int[np.ndarray, "matches 2"],
+    distinctiveness: Float[np.ndarray, " matches"],
+) -> tuple[Int[np.ndarray, "kept 2"], Float[np.ndarray, " kept"]]:
+    """Return matches of rows as those of each position's first feature, the most distinct of each position, rising."""
     matches = np.stack([first.first_index[matches[:, 0]], second.first_index[matches[:, 1]]], axis=1)
     for side in (0, 1):  # of matches that share a position, the most distinct stays
         order = np.lexsort([matches[:, 1 - side], -distinctiveness, matches[:, side]])
@@ -148,6 +165,10 @@ def match_descriptors(
         matches, distinctiveness = matches[kept], distinctiveness[kept]
     order = np.argsort(matches[:, 0], kind="stable")
     return matches[order], distinctiveness[order]
+
+
+def _hamming(products: Float[np.ndarray, " rows"], num_bits: int) -> Float[np.ndarray, " rows"]:
+    return (num_bits - products.astype(np.float64)) / 2
 
 
 def _distance(similarity: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:

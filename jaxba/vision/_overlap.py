@@ -1,59 +1,40 @@
-"""Where two images may show the same ground, from their largest features: what lies outside need not be compared.
+"""Where two images may show the same ground, from matches of their largest features: the rest need not be compared.
 
-An exact search over all features costs the product of their numbers. The `_COARSE` largest features of both, 3% of that
-cost, match well enough to fit a homography, loose enough for relief; features that it maps outside the other image by
-more than a margin have no partner there. At half an overlap the search is left with a quarter of its products. The
-ratio test then knows no second nearest from outside the common ground, where nothing can match.
+An exact search over all features costs the product of their numbers. A homography of a few matches, loose enough for
+relief, tells where the other image lies; features that it maps outside of that by more than a margin have no partner
+there. At half an overlap the search is left with a quarter of its products. The ratio test then knows no second nearest
+from outside the common ground, where nothing can match.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.vision._nearest import Descriptors, match_descriptors
-
-_COARSE = 1500
 _LEAST_MATCHES, _LEAST_INLIERS, _LEAST_SHARE = 16, 12, 0.5
-_APART = 5  # coarse matches below which two images are apart
 _LOOSE, _MARGIN = 0.02, 0.12  # of the longer side
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CommonGround:
-    """Features of both images that may have a partner in the other one; all of them where that is unknown.
-
-    - `is_apart`: so few of the largest features match that the images show different ground.
-    """
-
-    first: Int[np.ndarray, " rows"]
-    second: Int[np.ndarray, " columns"]
-    is_apart: bool
-
-
 def common_ground(
-    first: Descriptors,
-    second: Descriptors,
+    matches: Int[np.ndarray, "matches 2"],
     first_px: Float[np.ndarray, "rows 2"],
     second_px: Float[np.ndarray, "columns 2"],
     first_size_px: tuple[int, int],
     second_size_px: tuple[int, int],
-    ratio: float,
-) -> CommonGround:
-    """Return the features that need to be compared; the best features come first, as `detect_features` orders them."""
-    everything = np.arange(len(first_px)), np.arange(len(second_px))
-    coarse = match_descriptors(first.take(everything[0][:_COARSE]), second.take(everything[1][:_COARSE]), ratio)[0]
-    whole = CommonGround(first=everything[0], second=everything[1], is_apart=len(coarse) < _APART)
-    if len(coarse) < _LEAST_MATCHES:
+) -> tuple[Int[np.ndarray, " some"], Int[np.ndarray, " others"]]:
+    """Return the features of both images that may have a partner in the other one; all of them where it is not known.
+
+    - `matches`: of some of the features.
+    """
+    whole = np.arange(len(first_px)), np.arange(len(second_px))
+    if len(matches) < _LEAST_MATCHES:
         return whole
-    mapped = _homography(first_px[coarse[:, 0]], second_px[coarse[:, 1]], max(*first_size_px, *second_size_px))
+    mapped = _homography(first_px[matches[:, 0]], second_px[matches[:, 1]], max(*first_size_px, *second_size_px))
     if mapped is None:
         return whole
     rows = _lands_inside(mapped, first_px, first_size_px, second_size_px)
     columns = _lands_inside(np.linalg.inv(mapped), second_px, second_size_px, first_size_px)
     if rows is None or columns is None:
         return whole
-    return CommonGround(first=np.flatnonzero(rows), second=np.flatnonzero(columns), is_apart=False)
+    return np.flatnonzero(rows), np.flatnonzero(columns)
 
 
 def _homography(

@@ -54,6 +54,7 @@ class TwoView:
     - `is_inlier`: of each match. `is_planar`: the homography is the better model.
     - `model`: the better one; `none` where neither explains enough. `num_explained`: inliers of it, also then.
     - `rotation`, `direction`: `x_j = R x_i + t`, t of unit length; NaN without a pose.
+    - `fundamental`: `y^T F x = 0` of pixels: the pose's, or estimated; NaN where a plane alone explains the matches.
     - `residual_px`: median over the inliers, of the chosen model. `angle_rad`: median angle between the inliers' rays.
     """
 
@@ -63,8 +64,13 @@ class TwoView:
     num_explained: int
     rotation: Float[np.ndarray, "3 3"]
     direction: Float[np.ndarray, "3"]
+    fundamental: Float[np.ndarray, "3 3"]
     residual_px: float
     angle_rad: float
+
+    @property
+    def num_inliers(self) -> int:
+        return int(np.count_nonzero(self.is_inlier))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +151,9 @@ def verify(
         rotation, direction = np.asarray(pose.R), np.asarray(pose.t) / (length if length > 0 else 1.0)
         cosine = np.sum((first.rays(x[inlier]) @ rotation.T) * second.rays(y[inlier]), axis=1)
         angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
+        fundamental = _fundamental_of(pose, first, second) if length > 0 else None
+    if fundamental is None or (is_planar and pose is None):  # a plane's is anybody's
+        fundamental = np.full((3, 3), np.nan)
     return TwoView(
         is_inlier=is_inlier,
         is_planar=bool(is_planar),
@@ -152,6 +161,7 @@ def verify(
         num_explained=num_explained,
         rotation=rotation,
         direction=direction,
+        fundamental=fundamental,
         residual_px=float(np.median(residual[inlier])),
         angle_rad=angle,
     )
@@ -288,6 +298,7 @@ def _nothing(num_matches: int, num_explained: int) -> TwoView:
         num_explained=num_explained,
         rotation=np.full((3, 3), np.nan),
         direction=np.full(3, np.nan),
+        fundamental=np.full((3, 3), np.nan),
         residual_px=np.nan,
         angle_rad=np.nan,
     )

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxba.pipeline import match
 from jaxba.report import Told, pair_facts, pair_lines
 from jaxba.scene import EdgeStatus, Fallback, Features, Missed, Model, Photo, Reference, ViewGraph
-from jaxba.vision import Pixels, TwoView, decode, detect_features
+from jaxba.vision import PairMatches, Pixels, TwoView, _pair, decode, detect_features
 
 FOCAL_PX = 936.0
 
@@ -123,8 +123,9 @@ def test_a_pair_whose_common_ground_fails_is_matched_without_it_and_named(
         raise np.linalg.LinAlgError("Singular matrix")
 
     inputs = inputs_of(frames[:3])
+    monkeypatch.setattr(_pair, "_AGREED", 3000)  # by the largest features alone
     plain = match.run(inputs, match.Params())
-    monkeypatch.setattr(match, "common_ground", fail)
+    monkeypatch.setattr(_pair, "common_ground", fail)
     found = match.run(inputs, match.Params())
     assert np.array_equal(found.view_graph.status, plain.view_graph.status)
     assert plain.notes == () and len(found.notes) == len(found.view_graph.pairs)
@@ -146,7 +147,7 @@ def test_few_inliers_make_a_weak_edge_and_fewer_none(frames: list[Features]) -> 
     assert weak.status[0] == EdgeStatus.WEAK and 12 <= weak.num_inliers[0] < 30
     none = match.run(inputs_of(few), match.Params(min_inliers=25)).view_graph
     assert none.status[0] == EdgeStatus.REJECTED and none.num_inliers[0] == 0
-    assert none.num_putative[0] == weak.num_putative[0]
+    assert 12 <= none.num_putative[0] <= weak.num_putative[0] <= 20
 
 
 def test_unknown_focal_length_gives_matches_without_a_pose(frames: list[Features]) -> None:
@@ -215,9 +216,13 @@ def test_weak_pairs_are_counted_by_the_figure_that_they_miss(frames: list[Featur
 def test_the_first_figure_that_is_missed_is_named(num_matches: int, num_inliers: int, missed: Missed) -> None:
     two_view = TwoView(
         is_inlier=np.arange(num_matches) < num_inliers, is_planar=False, model="essential", num_explained=num_inliers,
-        rotation=np.eye(3), direction=np.array([1.0, 0, 0]), residual_px=1.0, angle_rad=0.1,
+        rotation=np.eye(3), direction=np.array([1.0, 0, 0]), fundamental=np.eye(3), residual_px=1.0, angle_rad=0.1,
     )  # fmt: skip
-    assert match._missed(num_matches, two_view, match.Params()) == missed
+    found = PairMatches(
+        matches=np.zeros((num_matches, 2), int), distinctiveness=np.ones(num_matches), two_view=two_view,
+        num_putative=num_matches,
+    )  # fmt: skip
+    assert match._missed(found, match.Params()) == missed
 
 
 def test_epipolar_threshold_is_that_of_matches_off_the_plane(frames: list[Features]) -> None:

@@ -108,17 +108,10 @@ def _neighbourhoods(
     near, cells = near[inside], cells[inside]
     order, column_order = np.argsort(number(cells), kind="stable"), np.argsort(number(of_column), kind="stable")
     near, of_row, of_column = near[order], number(cells)[order], number(of_column)[column_order]
-    for cell, rows in zip(*_grouped(of_row, near), strict=True):
+    found, starts = np.unique(of_row, return_index=True)
+    for cell, rows in zip(found.tolist(), np.split(near, starts[1:]), strict=False):  # a part also where there are none
         spans = [np.searchsorted(of_column, [cell + step - 1, cell + step + 2]) for step in (-width, 0, width)]
         columns = np.concatenate([column_order[start:end] for start, end in spans])
         if len(columns):
             for start in range(0, len(rows), _BLOCK):
                 yield rows[start : start + _BLOCK], columns
-
-
-def _grouped(
-    keys: Int[np.ndarray, " n"], values: Int[np.ndarray, " n"]
-) -> tuple[list[int], list[Int[np.ndarray, " some"]]]:
-    """Return each key of a sorted list, and the values that have it."""
-    found, starts = np.unique(keys, return_index=True)
-    return found.tolist(), np.split(values, starts[1:])

@@ -65,6 +65,21 @@ def test_features_off_their_line_or_out_of_reach_are_no_match() -> None:
         assert set(map(tuple, found)) <= set(map(tuple, verified)) and len(found) > 0.9 * len(verified)
 
 
+def test_nothing_is_found_where_all_is_foretold_outside_the_image() -> None:
+    first, second = two_images((200, 300))
+    beyond = second[0], second[1] + [1e5, 0.0], second[2]
+    assert len(guided(first, beyond, LEVEL_LINES, known(first, second, 40))) == 0
+
+
+def test_matches_on_one_line_stay_those_of_the_largest_features() -> None:
+    """No homography foretells a place from them."""
+    _, _, looks = two_images((0, 0), count=25000)[0]
+    looks = Descriptors(values=looks.first(2000).values, is_binary=False, first_index=np.arange(2000))
+    along = np.column_stack([np.linspace(0, SIZE[0], 2000), np.full(2000, 600.0)])
+    found = pair((np.arange(2000), along, looks), (np.arange(2000), along + np.array([50.0, 0.0]), looks))
+    assert found.two_view.num_inliers >= 1500 and np.all(found.matches[:, 0] == found.matches[:, 1])
+
+
 @pytest.mark.parametrize(("shift", "turn"), [((300, 200), 0.0), ((-500, 300), 3.0), ((0, 700), 0.4)])
 @pytest.mark.parametrize("relief", [0.0, 30.0])
 def test_the_largest_features_lead_to_the_matches_of_all(

@@ -143,7 +143,7 @@ def test_bent_photos_have_a_large_median_and_more_steps_do_not_help(
     monkeypatch.setattr(_rounds, "solve", lambda *a, max_nfev, **named: full(*a, max_nfev=min(max_nfev, 3), **named))
     survey, noise = made.copy(tmp_path, photos=True), np.random.default_rng(0)
     for path in photos_of(survey):
-        repaint(path, lambda a: bend(a, noise, 6.0))
+        repaint(path, lambda a: bend(a, noise, 7.0))
     loose = ("match.ransac_threshold=5", "adjust.track_threshold=4", "adjust.mad_factor=5", "adjust.loss=linear")
     result = found(survey, *loose, "adjust.max_rounds=1", until="adjust")
     assert result["large errors"].figures["median_px"] > 3 > 2 * result["large errors"].figures["edge_median_px"]

@@ -3,7 +3,7 @@
 1. The largest features of both are compared, 3% of the products of all, and where too few of them agree on a geometry
    so many more, 14%. If no more than a few match, the photos show different ground.
 2. Where they do not agree, the `_MOST` largest are compared, those on the common ground (see `_overlap.py`). They need
-   only find the geometry: of 400 pairs none was lost that had 30 verified matches by all 10,000 features.
+   only find the geometry: of 178 pairs with 30 verified matches by all 10,000 features one was lost, which had just 30.
 3. The geometry guides a second search (see `_guided.py`), whose matches are verified in place of the first ones. What
    few matches foretell is good to some ten pixels, so that they guide a first search without epipolar lines.
 """
@@ -23,6 +23,7 @@ from jaxba.vision._two_view import Pinhole, PosePrior, TwoView, verify
 _LARGEST = (1500, 3000)  # features
 _MOST = 5000  # of them, where these do not agree
 _APART = 5  # matches of them below which two images are apart
+_NO_LINES = np.full((3, 3), np.nan)
 _WIDER = 1.5  # the band about an epipolar line, against the threshold
 _AGREED, _AGREED_SHARE = 16, 0.6  # matches of them that make a geometry, also as a share
 
@@ -70,7 +71,9 @@ def match_pair(first: View, second: View, options: PairOptions, prior: PosePrior
     """Return the matches of two photos; those of different ground have none."""
     found = _largest(first, second, options, prior)
     if found.two_view.model != "none":
-        found = _guided(first, second, found, np.full((3, 3), np.nan), options, prior)
+        found = _guided(first, second, found, _NO_LINES, options, prior)
+        if not np.isfinite(found.two_view.fundamental).all():
+            return found
     elif found.num_putative >= _APART:
         found = _of_most(first, second, found, options, prior)
     if found.two_view.model != "none":

@@ -195,6 +195,17 @@ def test_a_crew_whose_workers_are_lost_works_with_those_that_come(scheduler: Pat
         assert len(pids) == 2 and not pids & set(killed)
 
 
+def test_a_worker_that_comes_to_a_crew_is_compared_first(scheduler: Path, monkeypatch: pytest.MonkeyPatch):
+    here = _cluster.installed()
+    with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
+        assert found is not None
+        given = found.executors[0].submit(double_slowly, 1)
+        monkeypatch.setattr(_cluster, "installed", lambda: {**here, "numpy": "1.0"})
+        kill(scheduler, 2)
+        with pytest.raises(JaxbaError, match=r"worker tcp://.* it has numpy .*, and this process has 1\.0; .*\.lock\)"):
+            given.result(90)
+
+
 def test_a_crew_says_what_to_do_where_a_call_ends_its_workers(scheduler: Path):
     with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
         assert found is not None

@@ -14,15 +14,17 @@ import hashlib
 import json
 import logging
 import platform
-import queue
+import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
+from jaxba.engine._given import Given
 from jaxba.engine._items import Ended, Item, called, late
 from jaxba.engine._versions import installed
 from jaxba.engine._workers import Resources
@@ -35,14 +37,15 @@ except ImportError as error:
 _ANSWER_S = 10.0  # for a scheduler to answer
 _PATIENCE_S = 60.0  # for workers to be there
 _LOOK_S = 0.5
+_TRIPS = 5
 _HEAD = 65536  # bytes of a file that tell it from others
 
 
-class _Given(NamedTuple):
-    """An item that a worker works on: since when, and how long it may take."""
+class _Begun(NamedTuple):
+    """An item that a worker works on: its call, since when, and how long it may take."""
 
     item: Item
-    address: str
+    given: Given
     begun_s: float
     seconds: float
 
@@ -79,7 +82,6 @@ class Cluster:
         self._reads = sorted(set(reads))
         self._alike: set[str] = set()
         self._stuck: set[str] = set()
-        self._ending: queue.SimpleQueue[distributed.Future] = queue.SimpleQueue()
         workers = self.workers()
         self.count = sum(worker["nthreads"] for worker in workers.values())
         self.memory_bytes = max(worker["memory_limit"] or float("inf") for worker in workers.values())
@@ -88,46 +90,52 @@ class Cluster:
         self, call: Callable[..., Any], items: Sequence[Item], *, alone: bool = False
     ) -> Iterator[tuple[Item, Ended]]:
         """Yield how each item ended, as they do."""
-        waiting, given = deque(items), dict[distributed.Future, _Given]()
+        waiting, working = deque(items), list[_Begun]()
+        wake = threading.Event()
         try:
-            while waiting or given:
+            while waiting or working:
+                wake.clear()
                 workers = self.workers()
-                for future, one in list(given.items()):
-                    if (ended := self._given_up(one, workers)) is not None:
-                        self.client.cancel([future])
-                        del given[future]
+                for one in list(working):
+                    if (ended := self._ended(one, workers)) is not None:
+                        working.remove(one)
+                        one.given.take_back()
                         yield one.item, ended
-                for address in _free(workers, given.values(), alone=alone)[: len(waiting)]:
+                for address in _free(workers, working, alone=alone)[: len(waiting)]:
                     item = waiting.popleft()
-                    future = self.client.submit(called, call, item.arguments, workers=[address], pure=False, retries=0)
-                    future.add_done_callback(self._ending.put)
-                    given[future] = _Given(item, address, time.monotonic(), self._resources.seconds_for(item.effort))
-                for future in self._done(given):
-                    one = given.pop(future)
-                    yield one.item, _ended(future, one)
+                    try:
+                        given = Given(self.client, address, called, call, item.arguments)
+                    except BrokenExecutor:
+                        self.workers()  # says what has gone
+                        raise
+                    given.fetched.add_done_callback(lambda _: wake.set())
+                    working.append(_Begun(item, given, time.monotonic(), self._resources.seconds_for(item.effort)))
+                wake.wait(_LOOK_S)
         finally:
-            with contextlib.suppress(Exception):  # a client that has lost its scheduler cannot
-                self.client.cancel(list(given))
+            for one in working:
+                one.given.take_back()
 
-    def _done(self, given: dict[distributed.Future, _Given]) -> list[distributed.Future]:
-        """Return those that have ended, after a while where none has."""
-        done = []
-        with contextlib.suppress(queue.Empty):
-            done.append(self._ending.get(timeout=_LOOK_S))
-            while True:
-                done.append(self._ending.get_nowait())
-        return [future for future in done if future in given and future.status in ("finished", "error")]
+    def _ended(self, one: _Begun, workers: dict[str, Any]) -> Ended | None:
+        """Return how an item has ended, by itself or since nothing more is to be expected of it; None for the others.
 
-    def _given_up(self, one: _Given, workers: dict[str, Any]) -> Ended | None:
-        """Return how an item has ended that will not end by itself; None for the others."""
-        if one.address not in workers:
-            return Ended("died", None, f"{one.address} was lost")
+        Raises `JaxbaError` where the call could not be made, or stops the run.
+        """
+        address = one.given.address
+        if one.given.fetched.done() and not one.given.is_lost():
+            if (error := one.given.raised()) is not None:
+                raise JaxbaError(f"worker {address}: {type(error).__name__}: {error}")
+            ended: Ended = one.given.fetched.result()
+            if ended.how == "error":
+                raise JaxbaError(f"{ended.reason} (on the worker {address})")
+            return ended
+        if one.given.fetched.done() or address not in workers:
+            return Ended("died", None, f"{address} was lost")
         if time.monotonic() - one.begun_s <= one.seconds:
             return None
         try:
-            self.client.restart_workers([one.address], timeout=_PATIENCE_S, raise_for_error=False)
+            self.client.restart_workers([address], timeout=_PATIENCE_S, raise_for_error=False)
         except ValueError:  # it has no nanny: its thread works on, and gets nothing any more
-            self._stuck.add(one.address)
+            self._stuck.add(address)
         return late(one.seconds)
 
     def workers(self) -> dict[str, Any]:
@@ -242,24 +250,12 @@ def threads_of(workers: dict[str, Any]) -> list[str]:
     return [address for address, worker in workers.items() for _ in range(worker["nthreads"])]
 
 
-def _free(workers: dict[str, Any], given: Any, *, alone: bool) -> list[str]:
+def _free(workers: dict[str, Any], working: Iterable[_Begun], *, alone: bool) -> list[str]:
     """Return the address of each thread that nothing was given to; of one, where no other item is worked on."""
-    busy = Counter(one.address for one in given)
+    busy = Counter(one.given.address for one in working)
     if alone:
         return [] if busy else list(workers)[:1]
     return list((Counter(threads_of(workers)) - busy).elements())
-
-
-def _ended(future: distributed.Future, one: _Given) -> Ended:
-    if future.status == "error":
-        error = future.exception()
-        if isinstance(error, distributed.KilledWorker):
-            return Ended("died", None, f"{one.address} was lost")
-        raise JaxbaError(f"worker {one.address}: {type(error).__name__}: {error}")
-    ended: Ended = future.result()
-    if ended.how == "error":
-        raise JaxbaError(f"{ended.reason} (on the worker {one.address})")
-    return ended
 
 
 def _client(resources: Resources) -> distributed.Client:
@@ -281,12 +277,20 @@ def _client(resources: Resources) -> distributed.Client:
             "..__TLS__CLIENT__CERT and ..__TLS__CLIENT__KEY."
         )
     try:
-        return distributed.Client(address, timeout=_ANSWER_S, set_as_default=False, name="jaxba")
+        return _connected(address)
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         raise JaxbaError(
             f"{where}: no scheduler answers at {address} in {_ANSWER_S:g} s. Start one with dask scheduler, or "
             "correct the address (tcp://host:8786; tls:// where it is encrypted)."
         ) from error
+
+
+def _connected(address: Any) -> distributed.Client:
+    """Return a client; ask again where a worker came to the scheduler meanwhile, over which dask's client trips."""
+    for _ in range(_TRIPS):
+        with contextlib.suppress(AssertionError):
+            return distributed.Client(address, timeout=_ANSWER_S, set_as_default=False, name="jaxba")
+    raise OSError("its first answer is not one of dask's")
 
 
 def _where(resources: Resources) -> str:

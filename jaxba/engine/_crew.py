@@ -1,11 +1,8 @@
 """Executors of a dask cluster, one a worker's thread, for calls of which a worker is to get the same ones every time.
 
-dask binds a call to a worker's address. Where that worker goes and there is no other at that moment, the call waits for
-one of the same address, which a worker that is started anew has not, also where dask is told that others will do. So a
-call is watched here, and given to another worker where its own has gone.
+A call whose worker goes is given to another one.
 """
 
-import asyncio
 import contextlib
 import functools
 import math
@@ -13,15 +10,14 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
+from concurrent.futures import CancelledError, Executor, Future, wait
 from pathlib import Path
 from typing import Any
-
-import distributed
 
 from jaxba._errors import JaxbaError
 from jaxba.engine._cluster import Cluster, cluster, threads_of
 from jaxba.engine._compile_cache import use_compilation_cache
+from jaxba.engine._given import Given
 from jaxba.engine._workers import Resources
 
 _KEPT_SHARE, _UNLIMITED = 0.5, 4e9  # of a worker's memory; bytes, where none is said
@@ -92,56 +88,38 @@ class _Result(Future[Any]):
     def __init__(self, places: _Places, number: int, call: Callable[[], Any]) -> None:
         super().__init__()
         self._places, self._number, self._call, self._lost = places, number, call, 0
-        self._give()
+        self._given = self._give()
 
-    def _give(self) -> None:
-        client = self._places.engine.client
-        loop: Any = client.loop
-        self._address = self._places.find(self._number)
-        try:
-            self._there = client.submit(_called_there, self._call, workers=[self._address], pure=False)
-            self._fetched = asyncio.run_coroutine_threadsafe(_fetch(self._there), loop.asyncio_loop)
-        except (OSError, RuntimeError) as error:  # the client was closed, since its scheduler has gone
-            raise BrokenExecutor(str(error)) from error
+    def _give(self) -> Given:
+        return Given(self._places.engine.client, self._places.find(self._number), _called_there, self._call)
 
     def result(self, timeout: float | None = None) -> Any:
         """Wait for what the call returns, or raises, and see that it comes."""
         until = math.inf if timeout is None else time.monotonic() + timeout
         while not self.cancelled():
-            if wait([self._fetched], _LOOK_S).done:
-                error = CancelledError() if self._fetched.cancelled() else self._fetched.exception()
-                of_call = self._there.status == "error" and not isinstance(error, distributed.KilledWorker)
-                if error is None or of_call:
-                    return self._fetched.result()
-                self._places.has_gone(self._address)  # raises where it is the scheduler
-            elif not self._places.has_gone(self._address):
+            if wait([self._given.fetched], _LOOK_S).done:
+                if not self._given.is_lost():
+                    return self._given.fetched.result()
+                self._places.has_gone(self._given.address)  # raises where it is the scheduler
+            elif not self._places.has_gone(self._given.address):
                 if time.monotonic() > until:
                     raise TimeoutError
                 continue
-            self._take_back()
+            self._given.take_back()
             self._lost += 1
             if self._lost == _MOST_LOST:
                 raise JaxbaError(
                     f"dask's worker processes end on the same piece of work ({self._lost} in a row, the last one "
-                    f"{self._address}). Raise the --memory-limit of dask worker, or run fewer workers on a machine. "
-                    "What is done is kept, and the same command goes on."
+                    f"{self._given.address}). Raise the --memory-limit of dask worker, or run fewer workers on a "
+                    "machine. What is done is kept, and the same command goes on."
                 )
-            self._give()
+            self._given = self._give()
         raise CancelledError
 
     def cancel(self) -> bool:
         """Take the call back, whatever its worker has made of it."""
-        self._take_back()
+        self._given.take_back()
         return super().cancel()
-
-    def _take_back(self) -> None:
-        self._fetched.cancel()
-        with contextlib.suppress(Exception):  # a client that has lost its scheduler cannot
-            self._there.cancel()
-
-
-async def _fetch(there: distributed.Future) -> Any:
-    return await there
 
 
 def _called_there(call: Callable[[], Any]) -> Any:

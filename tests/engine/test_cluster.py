@@ -72,6 +72,16 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield file
 
 
+def kill(scheduler: Path, count: int) -> list[int]:
+    """Kill as many workers as are asked for, once they are there; return their processes' numbers."""
+    with _cluster._client(Resources(scheduler_file=str(scheduler))) as client:
+        client.wait_for_workers(2, timeout=60)
+        killed = sorted(client.run(os.getpid).values())[:count]
+    for pid in killed:
+        os.kill(pid, signal.SIGKILL)
+    return killed
+
+
 def items(*numbers: int) -> list[Item]:
     return [Item(name=str(number), arguments=(number,), need_bytes=1e8) for number in numbers]
 
@@ -96,6 +106,15 @@ def test_an_item_whose_worker_is_killed_is_tried_again(scheduler: Path, tmp_path
     todo = [Item(name=str(n), arguments=(tmp_path, n), need_bytes=1e8) for n in range(3)]
     found = outcomes(killed_once, todo, Resources(scheduler_file=str(scheduler)))
     assert found == {str(n): (2 * n, None) for n in range(3)}
+
+
+def test_items_whose_workers_are_killed_while_others_are_recorded_have_their_results(scheduler: Path):
+    ending = work(double_slowly, items(*range(8)), Resources(scheduler_file=str(scheduler)))
+    found = [next(ending)]
+    time.sleep(1.0)  # the workers have done what they were given, and keep it
+    kill(scheduler, 2)
+    found += ending
+    assert {item.name: (result, failed) for item, result, failed in found} == {str(n): (2 * n, None) for n in range(8)}
 
 
 def test_an_error_of_the_run_stops_it_and_names_the_worker(scheduler: Path):
@@ -161,6 +180,22 @@ def test_a_scheduler_that_goes_or_has_no_worker_is_named(tmp_path: Path, monkeyp
                 list(ending)
 
 
+def test_a_client_that_trips_over_a_worker_that_comes_asks_again(scheduler: Path, monkeypatch: pytest.MonkeyPatch):
+    client, trips = distributed.Client, [3]
+
+    def tripping(*arguments: Any, **options: Any) -> distributed.Client:
+        if trips[0]:
+            trips[0] -= 1
+            raise AssertionError
+        return client(*arguments, **options)
+
+    monkeypatch.setattr(distributed, "Client", tripping)
+    assert outcomes(double, items(1), Resources(scheduler_file=str(scheduler))) == {"1": (2, None)}
+    trips[0] = 99
+    with pytest.raises(JaxbaError, match="no scheduler answers at tcp"):
+        list(work(double, items(1), Resources(scheduler_file=str(scheduler))))
+
+
 def test_a_crew_has_an_executor_a_thread(scheduler: Path):
     with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
         assert found is not None and len(found.executors) == 2 and 1e8 < found.memory_bytes < 1e12
@@ -171,16 +206,6 @@ def test_a_crew_has_an_executor_a_thread(scheduler: Path):
         assert none is None
 
 
-def kill(scheduler: Path, count: int) -> list[int]:
-    """Kill as many workers as are asked for, once they are there; return their processes' numbers."""
-    with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
-        client.wait_for_workers(2, timeout=60)
-        killed = sorted(client.run(os.getpid).values())[:count]
-    for pid in killed:
-        os.kill(pid, signal.SIGKILL)
-    return killed
-
-
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_crew_whose_workers_are_lost_works_with_those_that_come(scheduler: Path, count: int):
     with crew(Resources(scheduler_file=str(scheduler)), ()) as found:
@@ -189,7 +214,7 @@ def test_a_crew_whose_workers_are_lost_works_with_those_that_come(scheduler: Pat
         killed = kill(scheduler, count)
         assert [future.result(90) for future in given] == [2 * k for k in range(8)]
         # a thread each again, once the workers are there again
-        with distributed.Client(scheduler_file=str(scheduler), set_as_default=False) as client:
+        with _cluster._client(Resources(scheduler_file=str(scheduler))) as client:
             client.wait_for_workers(2, timeout=60)
         pids = {executor.submit(os.getpid).result(90) for executor in found.executors}
         assert len(pids) == 2 and not pids & set(killed)

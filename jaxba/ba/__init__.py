@@ -5,9 +5,10 @@ from jaxba.ba._compiler import fast_jit
 from jaxba.ba._plan import Plan, make_plan
 from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Free, Observations, Problem
-from jaxba.ba._projection import project_in_cameras
+from jaxba.ba._projection import camera_centers, project_in_cameras
 from jaxba.ba._quality import GroupErrors, Quality, quality, reprojection_errors
 from jaxba.ba._reject import Rejected, rejecting, solve_and_reject
+from jaxba.ba._reweighting import loss_derivatives
 from jaxba.ba._rows import JacobianBlock, Rows
 from jaxba.ba._scale_bars import with_scale_bars
 from jaxba.ba._solution import HistoryStep, Report, Solution
@@ -32,7 +33,7 @@ from jaxba.ba.tiles._merge import Merged, MergedTile, merge_tiles
 from jaxba.ba.tiles._partition import BlockTile, Partition, partition
 from jaxba.ba.tiles._solve_tiled import solve_tiled
 from jaxba.ba.uncertainty._camera_covariance import camera_covariance
-from jaxba.ba.uncertainty._covariance import Covariance, covariance
+from jaxba.ba.uncertainty._covariance import Covariance, covariance, statistics_compiler
 from jaxba.ba.uncertainty._propagate import Propagated, propagate
 from jaxba.ba.uncertainty._reliability import NONCENTRALITY, RowStatistics
 from jaxba.ba.uncertainty._reweight import Reweighted, solve_and_reweight
@@ -83,11 +84,13 @@ __all__ = [
     "Tuned",
     "Unknowns",
     "VarianceComponent",
+    "camera_centers",
     "camera_covariance",
     "check_gradients",
     "covariance",
     "fast_jit",
     "free_gauge",
+    "loss_derivatives",
     "make_plan",
     "merge_tiles",
     "partition",
@@ -105,6 +108,7 @@ __all__ = [
     "solve_batch",
     "solve_tiled",
     "statistics",
+    "statistics_compiler",
     "tune",
     "with_scale_bars",
 ]

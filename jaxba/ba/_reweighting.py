@@ -13,14 +13,19 @@ of the curvature far from the optimum, 1 the full curvature, fast near it.
 import functools
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from jaxba.ba._compiler import fast_jit
 from jaxba.geometry import AbstractLoss, Linear
 
 Components = list[Array]
 """A row's components, each an array over rows."""
+
+_CHUNK = 4096
 
 
 def reweighting(
@@ -43,3 +48,29 @@ def reweighting(
         return [root * (c - u * along) for u, c in zip(unit, column, strict=True)]
 
     return [root / (1 - alpha) * r for r in residual], reweighted
+
+
+def loss_derivatives(
+    loss: AbstractLoss, squared_norm: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return a loss's first and second derivative by the squared norm, for use on the host.
+
+    They are computed in pieces of one size, so that one program serves any number of them.
+
+    >>> from jaxba.geometry import Cauchy
+    >>> loss_derivatives(Cauchy(), np.array([0.0, 1.0]))[0].tolist()
+    [1.0, 0.5]
+    """
+    numbers = jax.tree.map(lambda number: np.asarray(number, float), loss)
+    found = np.empty((2, len(squared_norm)))
+    with jax.enable_x64(True):
+        for start in range(0, len(squared_norm), _CHUNK):
+            piece = squared_norm[start : start + _CHUNK]
+            filled = np.pad(piece, (0, _CHUNK - len(piece)))
+            found[:, start : start + len(piece)] = np.stack(_derivatives(numbers, filled))[:, : len(piece)]
+    return found[0], found[1]
+
+
+@fast_jit
+def _derivatives(loss: AbstractLoss, squared_norm: Float[Array, " n"]) -> tuple[Float[Array, " n"], ...]:
+    return loss.derivatives(squared_norm)[1:]

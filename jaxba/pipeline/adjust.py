@@ -187,6 +187,7 @@ def run_and_keep(inputs: Inputs, params: Params, room: Room | None = None) -> tu
         inputs.control,
         tiling,
         inputs.bars,
+        with_statistics=True,
     )
     sigmas = sfm.uncertainty(adjusted, reference, with_statistics=True)
     judged = sigmas.statistics

@@ -16,13 +16,14 @@ import dataclasses
 import functools
 import logging
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba._errors import JaxbaError
-from jaxba.ba import Problem, Solution
+from jaxba.ba import PlanShape, Problem, Solution, make_plan, statistics_compiler
 from jaxba.geometry import AbstractLoss
 from jaxba.scene import (
     BarFit,
@@ -55,6 +56,7 @@ _log = logging.getLogger(__name__)
 _START_ERROR = 0.005  # of the longer side: what start values are good to
 _FIRST_STEPS, _ROUND_STEPS, _ROUND_FTOL = 12, 40, 1e-4  # before the median has settled
 _CONVERGED = 0.01
+_SPARE = 0.03  # room for tracks that pruning cuts in two
 _LEAST_OBSERVATIONS = 3  # of an image: fewer do not fix a pose
 
 
@@ -74,6 +76,7 @@ class Adjusted:
     - `common_m`: what measured positions are off in common, as far as control tells it.
     - `bars`: how the block fits its scale bars.
     - `max_memory`: that solving in tiles was allowed; None in one piece.
+    - `shape`: of all rounds' plans; None in tiles. `compiled`: ends when what statistics call is compiled for it.
     - `pruned`: edges left out. `lost`: images that had too few observations left. `notes`: what else was decided.
     """
 
@@ -98,6 +101,8 @@ class Adjusted:
     on_control: OnControl | None = None
     bars: BarFit = dataclasses.field(default_factory=BarFit.nothing)
     max_memory: float | str | None = None
+    shape: PlanShape | None = None
+    compiled: Future[None] | None = None
 
     @functools.cached_property
     def spread(self) -> float:
@@ -126,11 +131,14 @@ def adjust(
     control: Control | None = None,
     tiling: Tiling | None = None,
     bars: ScaleBars | None = None,
+    *,
+    with_statistics: bool = False,
 ) -> Adjusted:
     """Return the adjusted block; `block` holds the start values, with points or without.
 
     - `features`: of every image, by index, to complete tracks from; without them tracks stay as they are.
     - `control`: surveyed points; its check points take no part. `tiling`: of large blocks. `bars`: known distances.
+    - `with_statistics`: that `uncertainty` will be asked for them: what they call is compiled beside the rounds.
 
     Raises `JaxbaError` where the block has fewer than two images, or no point of it is left.
     """
@@ -157,7 +165,7 @@ def adjust(
     matches = match_rows(view_graph, tracks)
     pruned, lost, notes, medians = [], [], [], []
     std_px, converged, settled, num_judged = 1.0, False, False, block.num_observations
-    limit_px, shape = None, rounds.shape(block, tracks)
+    limit_px, (shape, compiled) = None, _compiled(rounds, block, tracks, with_statistics=with_statistics)
     mark_used = np.ones(len(control.mark_point), bool)
     small, every = (
         [name for name in free_parameters(block.camera_model, num_images=num) if name not in settings.held]
@@ -212,7 +220,7 @@ def adjust(
             lost += [_lost(photos[i].name) for i in block.image_index[weak]]
             block = without_images(block, weak)
             rounds = dataclasses.replace(rounds, anchor=without_images(rounds.anchor, weak))
-            shape = rounds.shape(block, tracks)
+            shape, compiled = _compiled(rounds, block, tracks, with_statistics=with_statistics)
         if block.num_images < 2 or not block.num_points:
             raise JaxbaError(
                 f"No point is left after round {len(medians)} with a median error of {medians[-1]:.1f} px: the start "
@@ -261,7 +269,25 @@ def adjust(
         on_control=on_control,
         bars=bar_fit,
         max_memory=max_memory,
+        shape=shape,
+        compiled=compiled,
     )
+
+
+def _compiled(
+    rounds: Rounds, block: Block, tracks: Tracks, *, with_statistics: bool
+) -> tuple[PlanShape | None, Future[None] | None]:
+    """Return the shape of all rounds, None in tiles, and what ends when statistics are compiled, where asked for."""
+    whole = rounds.whole(block, tracks)
+    if whole is None:
+        return None, None
+    shape = make_plan(whole, spare=_SPARE).shape
+    if not with_statistics:
+        return shape, None
+    pool = ThreadPoolExecutor(1, "compile")
+    compiled = pool.submit(statistics_compiler(whole, shape, loss=rounds.loss(1.0), independent="tracks"))
+    pool.shutdown(wait=False)
+    return shape, compiled
 
 
 def _completed(

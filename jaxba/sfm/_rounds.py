@@ -29,7 +29,6 @@ from jaxba.sfm.control._control import ControlPart, Standing, before_control, co
 
 _log = logging.getLogger(__name__)
 
-_SPARE = 0.03  # room for tracks that pruning cuts in two
 _TRUSTING_ROUNDS = 2
 _TELL_EVERY_S = 1.0
 
@@ -114,15 +113,14 @@ class Rounds:
         standing: Standing | None = None,
         bars: tuple[ScaleBars, Bool[np.ndarray, " bars"]] | None = None,
     ) -> Solved:
-        """Solve a block; `free` are the camera's parameters that may change, `shape` is of `shape`.
+        """Solve a block; `free` are the camera's parameters that may change, `shape` is that of all rounds.
 
         - `mark_used`: of all marks of control. `number`: of the round, from 1.
         - `standing`: of control and positions; None where control does not hold the block. `bars`: all, and which of
           them hold it.
         """
         settings = self.settings
-        model = LOSSES[settings.loss]
-        loss = Linear() if model is Linear else model(f_scale=settings.f_scale / std_px)  # type: ignore[call-arg]
+        loss = self.loss(std_px)
         scale, let_go = position_scale(block, self.reference), 1.0
         if standing is None:
             standing = before_control(block, self.reference, self.control)
@@ -188,8 +186,8 @@ class Rounds:
         common_m = np.zeros(3) if common is None else np.asarray(solution.position_offset)[0]
         return Solved(block, error_px, problem, loss, solution, scale, common_m, control)
 
-    def shape(self, block: Block, tracks: Tracks) -> PlanShape | None:
-        """Return the shape of the block with every observation that may ever join it: all rounds share it.
+    def whole(self, block: Block, tracks: Tracks) -> Problem | None:
+        """Return the problem of the block with every observation that may ever join it, to tell shapes by.
 
         None for a block that is solved in tiles.
         """
@@ -207,8 +205,12 @@ class Rounds:
         )
         control = control_part(block, self.control, np.ones(len(self.control.mark_point), bool))
         common = None if control is None else before_control(block, self.reference, self.control).common
-        problem = to_problem(full, self.reference, self.photos, anchor=self.anchor, control=control, common=common)
-        return make_plan(problem, spare=_SPARE).shape
+        return to_problem(full, self.reference, self.photos, anchor=self.anchor, control=control, common=common)
+
+    def loss(self, std_px: float) -> AbstractLoss:
+        """Return the loss of reprojections of a sigma."""
+        model = LOSSES[self.settings.loss]
+        return Linear() if model is Linear else model(f_scale=self.settings.f_scale / std_px)  # type: ignore[call-arg]
 
 
 class _Told:

@@ -13,11 +13,10 @@ How far such an estimate gives way to a further measurement is another matter: b
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.ba import AbstractPrior, PositionPrior, Problem
+from jaxba.ba import AbstractPrior, PositionPrior, Problem, camera_centers, loss_derivatives
 from jaxba.geometry import AbstractLoss, GemanMcClure
 from jaxba.scene import Block
 from jaxba.sfm._points import redundancy_root
@@ -54,8 +53,7 @@ def spread(block: Block, error_px: Float[np.ndarray, " observations"], std_px: f
         return Spread()
     views = np.bincount(block.observation_point, minlength=block.num_points)
     comparable = error * redundancy_root(views)[block.observation_point]
-    with jax.enable_x64(True):
-        _, weight, change = (np.asarray(part) for part in loss.derivatives(jnp.asarray(comparable**2)))
+    weight, change = loss_derivatives(loss, comparable**2)
     slope = np.mean(weight + comparable**2 * change)
     if slope <= 0:  # a loss that turns back, with most errors beyond its turn
         return Spread()
@@ -76,13 +74,13 @@ def position_spread(problem: Problem, prior: PositionPrior) -> Spread:
 
     expectations of normal errors as in `spread`, over three coordinates.
     """
+    center = camera_centers(problem.poses)[prior.image_index]
     with jax.enable_x64(True):
-        center = np.asarray(problem.poses.center)[prior.image_index]
-        moved = center + prior.offset(np.asarray(problem.position_offset)) - prior.xyz
-        squared = np.sum((moved / prior.std_m) ** 2, axis=1)
-        weight, bent = (np.asarray(part) for part in prior.loss.derivatives(jnp.asarray(squared))[1:])
-        z = (np.arange(_STEPS) + 0.5) * _FARTHEST / _STEPS  # over sigma; chi's density of three degrees follows
-        of_normal, change = (np.asarray(part) for part in prior.loss.derivatives(jnp.asarray(z**2))[1:])
+        offset = np.asarray(prior.offset(np.asarray(problem.position_offset)))
+    squared = np.sum(((center + offset - prior.xyz) / prior.std_m) ** 2, axis=1)
+    weight, bent = loss_derivatives(prior.loss, squared)
+    z = (np.arange(_STEPS) + 0.5) * _FARTHEST / _STEPS  # over sigma; chi's density of three degrees follows
+    of_normal, change = loss_derivatives(prior.loss, z**2)
     share = z**2 * np.exp(-(z**2) / 2)
     share /= share.sum()
     slope = float(share @ (of_normal + 2 / 3 * z**2 * change))

@@ -21,6 +21,7 @@ constraints over its points, for who fits the block onto something by six parame
 """
 
 import dataclasses
+from concurrent.futures import wait
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,9 @@ def uncertainty(adjusted: Adjusted, reference: Reference, *, with_statistics: bo
     problem = weighed(adjusted.problem, times, block.num_observations)
     loss = dataclasses.replace(adjusted.loss, f_scale=adjusted.loss.f_scale / times)
     try:
-        room: dict[str, Any] = {"independent": "tracks", "max_memory": adjusted.max_memory}
+        room: dict[str, Any] = {"independent": "tracks", "max_memory": adjusted.max_memory, "like": adjusted.shape}
+        if adjusted.compiled is not None:
+            wait([adjusted.compiled])  # what cannot be compiled fails below
         of_all = statistics(problem, loss=loss, **room) if with_statistics else None
         found = covariance(problem, loss=loss, **room) if of_all is None else of_all.covariance
     except JaxbaError as error:

@@ -8,7 +8,17 @@ import scipy.stats
 from dense_reference import Dense, loss_derivatives
 from test_covariance import CASES
 
-from jaxba.ba import Problem, RowStatistics, Statistics, Step, prior_statistics, statistics
+from jaxba.ba import (
+    Problem,
+    RowStatistics,
+    Statistics,
+    Step,
+    _compiler,
+    make_plan,
+    prior_statistics,
+    statistics,
+    statistics_compiler,
+)
 from jaxba.ba.uncertainty._reliability import NONCENTRALITY, POWER, SIGNIFICANCE
 from jaxba.geometry import Linear
 
@@ -138,6 +148,26 @@ def test_statistics_of_priors_alone_are_the_same():
         assert one.name == other.name
         for name in ("redundancy", "test", "row_test", "detectable", "reach_m"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-9)
+
+
+def test_statistics_like_an_earlier_plan_are_the_same_and_compile_nothing_more():
+    make, loss = CASES["shared camera, every prior"]
+    problem = make()
+    like = make_plan(problem, spare=0.2).shape
+    statistics_compiler(problem, like, loss=loss, independent="tracks")()
+    compiled = _compiler._ahead.cache_info().misses
+    seen = problem.observations
+    views = np.bincount(seen.point_index)[seen.point_index]
+    keep = (np.arange(problem.num_observations) % 17 > 0) | (views < 4)  # no point is left with one
+    kept = {field.name: getattr(seen, field.name)[keep] for field in dataclasses.fields(seen)}
+    fewer = dataclasses.replace(problem, observations=dataclasses.replace(seen, **kept))
+    found = statistics(fewer, loss=loss, independent="tracks", like=like)
+    assert _compiler._ahead.cache_info().misses == compiled
+    expected = statistics(fewer, loss=loss, independent="tracks")
+    assert _compiler._ahead.cache_info().misses > compiled
+    np.testing.assert_allclose(found.covariance.points, expected.covariance.points, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(found.covariance.border, expected.covariance.border, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(found.observations.redundancy, expected.observations.redundancy, rtol=1e-6, atol=1e-9)
 
 
 def test_detectable_errors_are_those_of_the_level_and_power_of_the_test():

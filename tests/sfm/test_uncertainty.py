@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jaxba.ba import _compiler
 from jaxba.scene import Block
 from jaxba.sfm import Settings, adjust
 from jaxba.sfm._points import apply_points, triangulate_tracks
 from jaxba.sfm._spread import spread
-from jaxba.sfm._uncertainty import own_factors, own_variance, with_own_errors
+from jaxba.sfm._uncertainty import own_factors, own_variance, uncertainty, with_own_errors
 from jaxba.simulation.staged import Simulated, simulate, true_block
 
 STD_PX = 0.5
@@ -63,6 +64,23 @@ def test_a_points_variance_follows_the_noise_of_its_track(simulated: Simulated) 
 def test_own_variance_is_that_of_repeated_measurement(simulated: Simulated) -> None:
     block, _, point_m = _points(simulated)
     assert np.mean(point_m**2 / own_variance(block, STD_PX)) == pytest.approx(1.0, abs=0.06)
+
+
+def test_what_statistics_call_is_compiled_beside_the_rounds() -> None:
+    survey = simulate(10, seed=5, points_per_image=100.0)
+    made = adjust(
+        survey.block,
+        survey.tracks,
+        survey.view_graph,
+        survey.reference,
+        survey.photos,
+        Settings(),
+        with_statistics=True,
+    )
+    assert made.compiled is not None and made.compiled.result(300) is None
+    compiled = _compiler._ahead.cache_info().misses
+    found = uncertainty(made, survey.reference, with_statistics=True)
+    assert found.statistics is not None and _compiler._ahead.cache_info().misses == compiled
 
 
 def test_long_tails_widen_the_sigmas_and_normal_errors_do_not() -> None:

@@ -66,9 +66,15 @@ class Tile:
         unknowns.points[self.points] = found.points
 
 
-def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int, Tile, System]]:
-    """Return the tiles with their systems, the largest ones first, each with its number."""
-    shape = dataclasses.replace(bare_shape(problem), prior_rows=())  # a tile has some of the rows
+def cut(
+    problem: Problem, tree: Tree, loss: AbstractLoss, like: PlanShape | None = None
+) -> Iterator[tuple[int, Tile, System]]:
+    """Return the tiles with their systems, the largest ones first, each with its number.
+
+    - `like`: gives a problem's only tile the least sizes.
+    """
+    shape = bare_shape(problem, None if like is None or len(tree.tiles) > 1 else _of_tile(like))
+    shape = dataclasses.replace(shape, prior_rows=())  # a tile has some of the rows
     seen = problem.observations
     tile_of_row = tree.tile_of_point[np.asarray(seen.point_index)]
     rows_of_tile = np.split(np.argsort(tile_of_row, kind="stable"), np.cumsum(np.bincount(tile_of_row))[:-1])
@@ -99,6 +105,10 @@ def cut(problem: Problem, tree: Tree, loss: AbstractLoss) -> Iterator[tuple[int,
         for number in group:
             found, plan, tile = part(number, like)
             yield number, tile, make_system(found, plan, loss)
+
+
+def _of_tile(like: PlanShape) -> PlanShape:
+    return dataclasses.replace(like, linear_solver="dense", panel_images=1, band_panels=0)
 
 
 def _tile_of_rows(prior: AbstractPrior, owners: dict[str, Int[np.ndarray, " _"]]) -> Int[np.ndarray, " rows"]:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from jaxba.ba._compiler import compile_ahead
 from jaxba.ba._linearise import Linearisation, linearise
-from jaxba.ba._plan_shape import bare_shape
+from jaxba.ba._plan_shape import PlanShape, bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
@@ -45,12 +45,24 @@ class Call(NamedTuple):
     arguments: tuple[Any, ...]
 
 
+def compile_calls(calls: Iterable[Call], at_a_time: int = 2) -> None:
+    """Compile calls, so many programs at a time: XLA compiles a program on one core."""
+
+    def compile_one(call: Call) -> None:
+        with jax.enable_x64(True):  # of this thread
+            compile_ahead(call.program, *call.arguments)
+
+    with ThreadPoolExecutor(at_a_time) as pool:
+        list(pool.map(compile_one, calls))
+
+
 class Engine(TileWork):
     """A problem in tiles.
 
     - `budget`: how much of systems, factors and equations stays in memory. `folder`: for files of the rest.
     - `pool`: threads for the fronts above the tiles. `workers`: tiles that are worked on at a time here.
     - `elsewhere`: where the tiles of steps are worked on instead, which hold their systems then.
+    - `like`: as in `opened`.
     """
 
     def __init__(
@@ -64,6 +76,7 @@ class Engine(TileWork):
         pool: ThreadPoolExecutor,
         workers: int,
         elsewhere: Elsewhere | None = None,
+        like: PlanShape | None = None,
     ) -> None:
         free = problem.free
         of_unknowns = Step(
@@ -79,7 +92,7 @@ class Engine(TileWork):
         if elsewhere is not None:
             elsewhere.put_block(self)
         tiles: dict[int, tuple[Tile, TileFronts]] = {}
-        for number, tile, system in cut(problem, tree, loss):
+        for number, tile, system in cut(problem, tree, loss, like):
             row, column = np.asarray(system.block_row), np.asarray(system.block_column)
             count = int(np.count_nonzero(row != column))  # padding stands at the end
             tiles[number] = tile, fronts.tile_fronts(number, tile.order, row[:count], column[:count])
@@ -101,25 +114,21 @@ class Engine(TileWork):
         """Return a tile and its fronts."""
         return self.tiles[number]
 
-    def compile(self, unknowns: Unknowns, calls: Callable[[System, Unknowns, Linearisation], list[Call]]) -> None:
-        """Compile the work on tiles, two programs at a time; without it that happens when it is first done.
+    def calls(
+        self, unknowns: Unknowns, others: Callable[[System, Unknowns, Linearisation], list[Call]]
+    ) -> tuple[Call, ...]:
+        """Return the work on tiles, to be compiled with `compile_calls`; else that happens when it is first done.
 
-        - `calls`: what is called beside the way up, from a tile's system, unknowns and equations.
+        - `others`: what is called beside the way up, from a tile's system, unknowns and equations.
         """
         one_of_shape = {tile.plan.shape: number for number, (tile, _) in enumerate(self.tiles)}
-
-        def compile_one(call: Call) -> None:
-            with jax.enable_x64(True):  # of this thread
-                compile_ahead(call.program, *call.arguments)
-
-        with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core
-            done = []
-            for number in one_of_shape.values():
-                system, part, scalar = self.system(number), self.tiles[number][0].take(unknowns), np.zeros(())
-                model = jax.eval_shape(linearise, system, part, scalar)
-                done += calls(system, part, model)
-                done += [Call(hand_over, (system, model, scalar)), Call(linearise, (system, part, scalar))]
-            list(pool.map(compile_one, done))
+        found: list[Call] = []
+        for number in one_of_shape.values():
+            system, part, scalar = self.system(number), self.tiles[number][0].take(unknowns), np.zeros(())
+            model = jax.eval_shape(linearise, system, part, scalar)
+            found += others(system, part, model)
+            found += [Call(hand_over, (system, model, scalar)), Call(linearise, (system, part, scalar))]
+        return tuple(found)
 
     def costs(self, unknowns: Unknowns) -> tuple[float, float]:
         """Return the cost, and the cost without robust losses."""

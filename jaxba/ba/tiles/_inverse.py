@@ -65,8 +65,10 @@ class _OfTile(NamedTuple):
     tracks: TrackSums | None
 
 
-def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none", *, by_tracks: bool = False) -> None:
-    """Compile what `marginals` calls, side by side; without it that happens when it is called."""
+def calls_of_marginals(
+    engine: Engine, unknowns: Unknowns, rows: Rows = "none", *, by_tracks: bool = False
+) -> tuple[Call, ...]:
+    """Return what `marginals` calls, to be compiled ahead; without that it happens when it is called."""
 
     def calls(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
         shape = system.shape
@@ -89,7 +91,7 @@ def compile_marginals(engine: Engine, unknowns: Unknowns, rows: Rows = "none", *
             found.append(Call(pixel_leverage, (system, part, inverse, joint)))
         return found
 
-    engine.compile(unknowns, calls)
+    return engine.calls(unknowns, calls)
 
 
 def marginals(

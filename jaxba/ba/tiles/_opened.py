@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from jaxba.ba._plan_shape import bare_shape
+from jaxba.ba._plan_shape import PlanShape, bare_shape
 from jaxba.ba._problem import Problem
 from jaxba.ba.tiles._budget import memory_limit, plan_memory
 from jaxba.ba.tiles._dissect import dissect
@@ -38,12 +38,14 @@ def opened(
     columns: int = 1,
     executors: Sequence[Executor] | None = None,
     executor_memory: float | str = EXECUTOR_MEMORY,
+    like: PlanShape | None = None,
 ) -> Iterator[Engine]:
     """Yield the engine of a problem that was checked, in double precision; its files are gone at the end.
 
     - `label`: of the function that asks, for messages. `max_memory` to `workers`, `executors`: see
       `solve_tiled`.
     - `inverse`: whether its inverse is asked for, which takes more memory than steps do. `columns`: right-hand sides.
+    - `like`: of an earlier plan; a problem in one tile shares what was compiled for it.
 
     Raises `JaxbaError` for options out of range, and where memory does not suffice.
     """
@@ -70,4 +72,4 @@ def opened(
         if executors is not None:
             kept = memory_limit(label, executor_memory, "executor_memory")
             elsewhere = Elsewhere(label, executors, Path(files).absolute(), kept)
-        yield Engine(problem, loss, tree, fronts, budget, Path(files), pool, int(workers), elsewhere)
+        yield Engine(problem, loss, tree, fronts, budget, Path(files), pool, int(workers), elsewhere, like)

@@ -6,9 +6,12 @@ Poses are tangent steps (w in rad, v in metres) in the camera's frame, as `Pose.
 """
 
 import dataclasses
+import functools
 import os
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -20,8 +23,8 @@ from jaxba.ba._system import own_unknowns
 from jaxba.ba._unknowns import Unknowns, antenna_names
 from jaxba.ba.checks import Dropped, prepare, require_gauge
 from jaxba.ba.tiles._dense import NotPositive
-from jaxba.ba.tiles._engine import Engine
-from jaxba.ba.tiles._inverse import Marginals, Rows, compile_marginals, marginals
+from jaxba.ba.tiles._engine import Engine, compile_calls
+from jaxba.ba.tiles._inverse import Marginals, Rows, calls_of_marginals, marginals
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
 from jaxba.ba.tiles._right_hand_sides import solved
 from jaxba.ba.uncertainty._inner_constraints import free_block, num_free, of_photos_alone
@@ -82,6 +85,7 @@ def covariance(
     max_observations: float = TILE_OBSERVATIONS,
     folder: str | os.PathLike[str] | None = None,
     workers: int | None = None,
+    like: PlanShape | None = None,
 ) -> Covariance:
     """Return the covariances at the problem's present values; call it on `solution.apply(problem)`.
 
@@ -92,6 +96,8 @@ def covariance(
       in all their images. That tells in `border`, intrinsics that images share, lever arm and position offsets
       (`_track_scores.py`).
     - `max_memory`, `max_observations`, `folder`, `workers`: as in `solve_tiled`.
+    - `like`: shape of an earlier plan, as in `make_plan`: a problem of up to `max_observations` shares what was
+      compiled for it (`statistics_compiler`).
 
     Raises `JaxbaError` where the problem has no gauge, where something in it is not determined, and where memory or
     disk do not suffice.
@@ -107,6 +113,7 @@ def covariance(
         "max_observations": max_observations,
         "folder": folder,
         "workers": workers,
+        "like": like,
     }
     loss = Linear() if loss is None else loss
     return marginals_at("Covariance", problem, loss, datum, independent, "none", **room).covariance
@@ -154,6 +161,33 @@ def marginals_at(
     return At(problem, of_all, found.leverages, prepared.kept)
 
 
+def statistics_compiler(
+    problem: Problem, like: PlanShape, *, loss: AbstractLoss | None = None, independent: Independent = "observations"
+) -> Callable[[], None]:
+    """Return what compiles that which `statistics` will call, to be called in a thread beside other work.
+
+    - `problem`: as it will be by then, but for its values and for observations and points that come and go; where it
+      is not, `statistics` compiles as without.
+    - `like`: as `statistics` will be given. `loss`, `independent`: likewise.
+
+    Nothing is compiled for a problem in several tiles, whose shapes are not known before.
+
+    >>> import jaxba
+    >>> problem = jaxba.synthetic.uav_block(8).problem
+    >>> shape = jaxba.ba.make_plan(problem, spare=0.1).shape
+    >>> jaxba.ba.statistics_compiler(problem, shape)()
+    >>> jaxba.statistics(problem, like=shape).covariance.redundancy > 0
+    True
+    """
+    loss = Linear() if loss is None else loss
+    if problem.num_observations > TILE_OBSERVATIONS:
+        return lambda: None
+    with opened("statistics", problem, loss, inverse=True, like=like) as engine:
+        calls = calls_of_marginals(engine, own_unknowns(problem), "all", by_tracks=independent == "tracks")
+        of_shapes = [call._replace(arguments=jax.eval_shape(lambda *same: same, *call.arguments)) for call in calls]
+    return functools.partial(compile_calls, of_shapes, at_a_time=1)
+
+
 def _of_photos(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, by_tracks: bool, **room: Any) -> Marginals:
     """Return the marginals under inner constraints; the reach of rows, which those would tell, is not known."""
     block = free_block(label, problem)
@@ -172,7 +206,7 @@ def _of_priors(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, by_
     require_gauge(problem, label)
     unknowns = own_unknowns(problem)
     with opened(label.lower(), problem, loss, inverse=True, **room) as engine:
-        compile_marginals(engine, unknowns, rows, by_tracks=by_tracks)
+        compile_calls(calls_of_marginals(engine, unknowns, rows, by_tracks=by_tracks))
         found = _marginals(engine, problem, unknowns, 0.0, rows, by_tracks)
         if found is None or not _determined(found):
             weakest = _weakest(_marginals(engine, problem, unknowns, _PROBING), problem)

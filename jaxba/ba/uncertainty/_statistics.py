@@ -10,14 +10,14 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtrc
 
 from jaxba._errors import JaxbaError
+from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import AbstractPrior, Problem
+from jaxba.ba._reweighting import loss_derivatives
 from jaxba.ba._tables import (
     DataFrame,
     cameras_table,
@@ -155,6 +155,7 @@ def statistics(
     max_observations: float = TILE_OBSERVATIONS,
     folder: str | os.PathLike[str] | None = None,
     workers: int | None = None,
+    like: PlanShape | None = None,
 ) -> Statistics:
     """Return the statistics at the problem's present values; call it on `solution.apply(problem)`.
 
@@ -174,6 +175,7 @@ def statistics(
         "max_observations": max_observations,
         "folder": folder,
         "workers": workers,
+        "like": like,
     }
     problem, found, leverages, kept = marginals_at("Statistics", problem, loss, datum, independent, "all", **room)
     of_observations = leverages[0]
@@ -227,9 +229,7 @@ def _weight(loss: AbstractLoss, rows: Leverage) -> Float[np.ndarray, " rows"]:
     """Return the weight that a loss gives each row."""
     if isinstance(loss, Linear):
         return np.ones(len(rows.residual))
-    with jax.enable_x64(True):
-        slope = loss.derivatives(jnp.asarray(np.sum(np.asarray(rows.residual) ** 2, axis=1)))[1]
-    return np.maximum(np.asarray(slope), 0.0)
+    return np.maximum(loss_derivatives(loss, np.sum(np.asarray(rows.residual, float) ** 2, axis=1))[0], 0.0)
 
 
 def _sigmas(prior: AbstractPrior, shape: tuple[int, ...]) -> Float[np.ndarray, "rows components"]:

@@ -17,7 +17,7 @@ chance (Ledoit and Wolf 2004, toward A), with the sizes of matrices measured by 
     1 - b^2 / |M - A|^2,    b^2 = sum over tracks of |u u^T / f|^2 - |M|^2 / tracks
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -53,7 +53,7 @@ class TrackSums(NamedTuple):
             return np.zeros(alike.shape)
         factor = float(self.freedom / self.squared)
         found = factor * np.asarray(self.scores)
-        unit, inverse = (np.asarray(part) for part in _unit_and_inverse(jnp.asarray(corner)))
+        unit, inverse = _unit_and_inverse(corner, np)
 
         def square(matrix: Float[np.ndarray, "border border"]) -> float:
             product = inverse @ (matrix / np.outer(unit, unit))
@@ -64,13 +64,14 @@ class TrackSums(NamedTuple):
         return more * max(1 - chance / all_of_it, 0.0) if all_of_it > 0 else np.zeros(alike.shape)
 
 
-def _unit_and_inverse(
-    corner: Float[Array, "border border"],
-) -> tuple[Float[Array, " border"], Float[Array, "border border"]]:
-    """Return the sigmas of the shared unknowns and the inverse of their correlations; what is fixed has zeros in it."""
-    variance = jnp.diagonal(corner)
-    unit = jnp.where(variance > 0, jnp.sqrt(jnp.abs(variance)), 1.0)
-    return unit, jnp.linalg.pinv(corner / jnp.outer(unit, unit), hermitian=True)
+def _unit_and_inverse(corner: Any, xp: Any) -> tuple[Any, Any]:
+    """Return the sigmas of the shared unknowns and the inverse of their correlations; what is fixed has zeros in it.
+
+    - `corner`: the covariance of the shared unknowns. `xp`: numpy or `jax.numpy`, whichever its arrays are of.
+    """
+    variance = xp.diagonal(corner)
+    unit = xp.where(variance > 0, xp.sqrt(xp.abs(variance)), 1.0)
+    return unit, xp.linalg.pinv(corner / xp.outer(unit, unit), hermitian=True)
 
 
 def track_sums(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint: Joint) -> TrackSums:
@@ -104,7 +105,7 @@ def track_sums(system: System, unknowns: Unknowns, inverse: InverseBlocks, joint
             squared + jnp.sum(residual**2),
         ), ()
 
-    unit, of_correlations = _unit_and_inverse(corner)
+    unit, of_correlations = _unit_and_inverse(corner, jnp)
     dtype = unknowns.points.dtype
     start = (
         jnp.zeros((shape.num_points, shape.border), dtype),

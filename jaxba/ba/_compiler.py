@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxba.ba._kept_programs import program
+from jaxba.ba._kept_programs import Program, program
 
 _FAST = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 
@@ -53,17 +53,30 @@ def call_compiled(function: Callable[..., Any], *arguments: Any) -> Any:
 
 def compile_ahead(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     """Return what `call_compiled` calls for arguments of these shapes, which may be `jax.ShapeDtypeStruct`s."""
+    return _ahead(function, *_shapes(arguments), platform())
+
+
+def result_shapes(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return what `call_compiled` would return, a tree of `jax.ShapeDtypeStruct`s; a kept program tells it untraced."""
+    return _program(function, *_shapes(arguments), platform()).result
+
+
+def _shapes(arguments: tuple[Any, ...]) -> tuple[Any, tuple[tuple[tuple[int, ...], str], ...]]:
     leaves, structure = jax.tree.flatten(arguments)
-    shapes = tuple((jax.numpy.shape(leaf), jax.numpy.result_type(leaf).name) for leaf in leaves)
-    return _ahead(function, structure, shapes, platform())
+    return structure, tuple((jax.numpy.shape(leaf), jax.numpy.result_type(leaf).name) for leaf in leaves)
 
 
 @functools.lru_cache(maxsize=64)
-def _ahead(
+def _ahead(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
+    return _program(function, *shapes).compiled()
+
+
+@functools.lru_cache(maxsize=16)  # each holds what it was lowered to
+def _program(
     function: Callable[..., Any], structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...], _: str
-) -> Callable[..., Any]:
+) -> Program:
     arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
-    return program(function, arguments, compiler_options(), made_from=function).compiled()
+    return program(function, arguments, compiler_options(), made_from=function)
 
 
 def platform() -> str:

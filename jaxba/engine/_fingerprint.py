@@ -192,8 +192,20 @@ def _home(module: str, name: str) -> str:
     path = _source(module)
     if path is None or path.name != "__init__.py":
         return module
+    origin = _origins(path).get(name)
+    if origin is None:
+        return module
+    level, within = origin
+    return _home(f"{module}.{within}" if level else within, name)
+
+
+@functools.cache
+def _origins(path: Path) -> dict[str, tuple[int, str]]:
+    """Return where the names of a package come from: the level of the import, 0 if absolute, and the module."""
     stub = path.with_suffix(".pyi")  # of a package whose names load their modules when they are first used
+    found: dict[str, tuple[int, str]] = {}
     for node in _statements(ast.parse((stub if stub.is_file() else path).read_bytes())):
-        if isinstance(node, ast.ImportFrom) and node.module and any(a.name == name for a in node.names):
-            return _home(f"{module}.{node.module}" if node.level else node.module, name)
-    return module
+        if isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                found.setdefault(alias.name, (node.level, node.module))
+    return found

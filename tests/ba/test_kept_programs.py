@@ -69,6 +69,7 @@ def _forget() -> None:
     """Be like a process that has compiled nothing."""
     _descend._compile.cache_clear()
     _compiler._ahead.cache_clear()
+    _compiler._program.cache_clear()
     jax.clear_caches()
 
 
@@ -128,6 +129,7 @@ def test_what_jax_had_compiled_before_is_not_written_however_often_it_is_asked_f
     _forget()  # like a process that finds jax's cache alone
     for _ in range(3):
         _compiler._ahead.cache_clear()
+        _compiler._program.cache_clear()
         assert call_compiled(_doubled, np.ones(3)).tolist() == [2.0] * 3
         assert not list(folder.glob("*.code"))
 

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.ba._compiler import compile_ahead
+from jaxba.ba._compiler import compile_ahead, result_shapes
 from jaxba.ba._linearise import Linearisation, linearise
 from jaxba.ba._plan_shape import PlanShape, bare_shape
 from jaxba.ba._problem import Problem
@@ -45,14 +45,29 @@ class Call(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-def compile_calls(calls: Iterable[Call], at_a_time: int = 2) -> None:
-    """Compile calls, so many programs at a time: XLA compiles a program on one core."""
+def compile_tiles(
+    ones: Iterable[tuple[System, Unknowns]],
+    others: Callable[[System, Unknowns, Linearisation], list[Call]],
+    at_a_time: int = 2,
+) -> None:
+    """Compile the work on tiles, so many programs at a time; without it that happens when it is first done.
+
+    - `ones`: those of `Engine.one_of_each_shape`. `others`: what is called beside the way up, from a tile's system,
+      unknowns and equations.
+    """
 
     def compile_one(call: Call) -> None:
         with jax.enable_x64(True):  # of this thread
             compile_ahead(call.program, *call.arguments)
 
-    with ThreadPoolExecutor(at_a_time) as pool:
+    calls: list[Call] = []
+    with jax.enable_x64(True):
+        for system, part in ones:
+            scalar = np.zeros(())
+            model = result_shapes(linearise, system, part, scalar)
+            calls += others(system, part, model)
+            calls += [Call(hand_over, (system, model, scalar)), Call(linearise, (system, part, scalar))]
+    with ThreadPoolExecutor(at_a_time) as pool:  # XLA compiles a program on one core
         list(pool.map(compile_one, calls))
 
 
@@ -114,21 +129,11 @@ class Engine(TileWork):
         """Return a tile and its fronts."""
         return self.tiles[number]
 
-    def calls(
-        self, unknowns: Unknowns, others: Callable[[System, Unknowns, Linearisation], list[Call]]
-    ) -> tuple[Call, ...]:
-        """Return the work on tiles, to be compiled with `compile_calls`; else that happens when it is first done.
-
-        - `others`: what is called beside the way up, from a tile's system, unknowns and equations.
-        """
+    def one_of_each_shape(self, unknowns: Unknowns) -> list[tuple[System, Unknowns]]:
+        """Return the system and the unknowns of one tile of each shape, as trees of `jax.ShapeDtypeStruct`s."""
         one_of_shape = {tile.plan.shape: number for number, (tile, _) in enumerate(self.tiles)}
-        found: list[Call] = []
-        for number in one_of_shape.values():
-            system, part, scalar = self.system(number), self.tiles[number][0].take(unknowns), np.zeros(())
-            model = jax.eval_shape(linearise, system, part, scalar)
-            found += others(system, part, model)
-            found += [Call(hand_over, (system, model, scalar)), Call(linearise, (system, part, scalar))]
-        return tuple(found)
+        ones = [(self.system(number), self.tiles[number][0].take(unknowns)) for number in one_of_shape.values()]
+        return jax.eval_shape(lambda: ones)
 
     def costs(self, unknowns: Unknowns) -> tuple[float, float]:
         """Return the cost, and the cost without robust losses."""

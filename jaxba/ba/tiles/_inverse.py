@@ -6,14 +6,14 @@ of its points from the blocks of the inverse that its own images have in common 
 of the whole is nowhere: of a node's part its children's parts are taken, and it goes.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.ba._compiler import call_compiled
+from jaxba.ba._compiler import call_compiled, result_shapes
 from jaxba.ba._linearise import Linearisation
 from jaxba.ba._plan_shape import num_rows
 from jaxba.ba._problem import Problem
@@ -66,9 +66,9 @@ class _OfTile(NamedTuple):
 
 
 def calls_of_marginals(
-    engine: Engine, unknowns: Unknowns, rows: Rows = "none", *, by_tracks: bool = False
-) -> tuple[Call, ...]:
-    """Return what `marginals` calls, to be compiled ahead; without that it happens when it is called."""
+    rows: Rows = "none", *, by_tracks: bool = False
+) -> Callable[[System, Unknowns, Linearisation], list[Call]]:
+    """Return what tells `compile_tiles` what `marginals` calls."""
 
     def calls(system: System, part: Unknowns, model: Linearisation) -> list[Call]:
         shape = system.shape
@@ -80,18 +80,23 @@ def calls_of_marginals(
             np.zeros((shape.border, shape.border)),
         )
         of_points = system, model, inverse, np.zeros(())
-        joint = jax.eval_shape(joint_marginals, *of_points)
-        of_all = joint_marginals if rows == "all" or by_tracks else point_marginals
-        found = [Call(of_all, of_points), Call(squares, (system, part))]
-        if by_tracks:
-            found.append(Call(track_sums, (system, part, inverse, joint)))
+        found = [Call(squares, (system, part))]
+        if rows != "all" and not by_tracks:
+            points = result_shapes(point_marginals, *of_points)
+            found.append(Call(point_marginals, of_points))
+        else:
+            joint = result_shapes(joint_marginals, *of_points)
+            points = joint.points
+            found.append(Call(joint_marginals, of_points))
+            if by_tracks:
+                found.append(Call(track_sums, (system, part, inverse, joint)))
+            if rows == "all":
+                found.append(Call(pixel_leverage, (system, part, inverse, joint)))
         if rows != "none":
-            found.append(Call(prior_leverages, (system, part, inverse, joint.points)))
-        if rows == "all":
-            found.append(Call(pixel_leverage, (system, part, inverse, joint)))
+            found.append(Call(prior_leverages, (system, part, inverse, points)))
         return found
 
-    return engine.calls(unknowns, calls)
+    return calls
 
 
 def marginals(

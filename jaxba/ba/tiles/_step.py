@@ -27,7 +27,7 @@ from jaxba.ba._solvers import (
 from jaxba.ba._system import System
 from jaxba.ba._unknowns import Step, Unknowns
 from jaxba.ba.tiles._dense import NotPositive
-from jaxba.ba.tiles._engine import Call, Engine, compile_calls
+from jaxba.ba.tiles._engine import Call, Engine, compile_tiles
 from jaxba.ba.tiles._programs import Sums, put_back
 from jaxba.geometry import Pose
 
@@ -46,7 +46,7 @@ class Stepper:
 
     def compile(self, unknowns: Unknowns) -> None:
         """Compile what a step calls, side by side; without it that happens at the first one."""
-        compile_calls(self.engine.calls(unknowns, _calls_of_step))
+        compile_tiles(self.engine.one_of_each_shape(unknowns), _calls_of_step)
 
     def step(self, unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
         """Return the unknowns and the state after a step was tried."""

@@ -11,7 +11,6 @@ import os
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -23,7 +22,7 @@ from jaxba.ba._system import own_unknowns
 from jaxba.ba._unknowns import Unknowns, antenna_names
 from jaxba.ba.checks import Dropped, prepare, require_gauge
 from jaxba.ba.tiles._dense import NotPositive
-from jaxba.ba.tiles._engine import Engine, compile_calls
+from jaxba.ba.tiles._engine import Engine, compile_tiles
 from jaxba.ba.tiles._inverse import Marginals, Rows, calls_of_marginals, marginals
 from jaxba.ba.tiles._opened import TILE_OBSERVATIONS, opened
 from jaxba.ba.tiles._right_hand_sides import solved
@@ -183,9 +182,9 @@ def statistics_compiler(
     if problem.num_observations > TILE_OBSERVATIONS:
         return lambda: None
     with opened("statistics", problem, loss, inverse=True, like=like) as engine:
-        calls = calls_of_marginals(engine, own_unknowns(problem), "all", by_tracks=independent == "tracks")
-        of_shapes = [call._replace(arguments=jax.eval_shape(lambda *same: same, *call.arguments)) for call in calls]
-    return functools.partial(compile_calls, of_shapes, at_a_time=1)
+        ones = engine.one_of_each_shape(own_unknowns(problem))
+    calls = calls_of_marginals("all", by_tracks=independent == "tracks")
+    return functools.partial(compile_tiles, ones, calls, at_a_time=1)
 
 
 def _of_photos(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, by_tracks: bool, **room: Any) -> Marginals:
@@ -206,7 +205,7 @@ def _of_priors(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, by_
     require_gauge(problem, label)
     unknowns = own_unknowns(problem)
     with opened(label.lower(), problem, loss, inverse=True, **room) as engine:
-        compile_calls(calls_of_marginals(engine, unknowns, rows, by_tracks=by_tracks))
+        compile_tiles(engine.one_of_each_shape(unknowns), calls_of_marginals(rows, by_tracks=by_tracks))
         found = _marginals(engine, problem, unknowns, 0.0, rows, by_tracks)
         if found is None or not _determined(found):
             weakest = _weakest(_marginals(engine, problem, unknowns, _PROBING), problem)

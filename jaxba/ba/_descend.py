@@ -5,7 +5,6 @@ are apart. jax's persistent cache, where it is switched on, keeps the result acr
 """
 
 import functools
-import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,7 +26,6 @@ from jaxba.ba._system import System, without_losses
 from jaxba.ba._unknowns import Unknowns
 
 _KEPT = 32
-_SMALL = 3_000_000  # entries of all arrays
 _SURELY_FREE = 1e8  # bytes
 
 
@@ -153,9 +151,7 @@ def _compile(
     def plain_cost(system: System, unknowns: Unknowns) -> Float[Array, ""]:
         return cost(system, unknowns)
 
-    # the steps of a large program run long enough to pay for the optimisations
-    small = sum(math.prod(shape) for shape, _ in shapes) < _SMALL
-    made = functools.partial(program, options=compiler_options() if small else {}, made_from=rest)
+    made = functools.partial(program, options=compiler_options(), made_from=rest)
     start = made(init, (numbers, unknowns, system))
     programs = made(step, (numbers, unknowns, start.result, system)), start, made(plain_cost, (plain, unknowns))
     with ThreadPoolExecutor(2) as pool:  # XLA compiles a program on one core

@@ -15,6 +15,7 @@ Convergence is judged by the median of the errors: it changes by less than 1%.
 import dataclasses
 import functools
 import logging
+import threading
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -153,6 +154,26 @@ def adjust(
         control=control,
         tiling=Tiling() if tiling is None else tiling,
     )
+    bars = ScaleBars.nothing() if bars is None else bars
+    stop = threading.Event()
+    try:
+        return _in_rounds(rounds, block, tracks, view_graph, features, bars, stop if with_statistics else None)
+    except BaseException:
+        stop.set()
+        raise
+
+
+def _in_rounds(
+    rounds: Rounds,
+    block: Block,
+    tracks: Tracks,
+    view_graph: ViewGraph,
+    features: Mapping[int, Features] | None,
+    bars: ScaleBars,
+    stop: threading.Event | None,
+) -> Adjusted:
+    """Return what `adjust` does; `stop`: of what is compiled for statistics, None where it is not."""
+    reference, photos, settings, control = rounds.reference, rounds.photos, rounds.settings, rounds.control
     if not block.num_points:
         limit = 4 * settings.track_threshold
         block = apply_points(block, tracks, triangulate_tracks(block, tracks, settings.min_angle_rad, limit))
@@ -165,7 +186,7 @@ def adjust(
     matches = match_rows(view_graph, tracks)
     pruned, lost, notes, medians = [], [], [], []
     std_px, converged, settled, num_judged = 1.0, False, False, block.num_observations
-    limit_px, (shape, compiled) = None, _compiled(rounds, block, tracks, with_statistics=with_statistics)
+    limit_px, (shape, compiled) = None, _compiled(rounds, block, tracks, stop)
     mark_used = np.ones(len(control.mark_point), bool)
     small, every = (
         [name for name in free_parameters(block.camera_model, num_images=num) if name not in settings.held]
@@ -220,7 +241,7 @@ def adjust(
             lost += [_lost(photos[i].name) for i in block.image_index[weak]]
             block = without_images(block, weak)
             rounds = dataclasses.replace(rounds, anchor=without_images(rounds.anchor, weak))
-            shape, compiled = _compiled(rounds, block, tracks, with_statistics=with_statistics)
+            shape, compiled = _compiled(rounds, block, tracks, stop)
         if block.num_images < 2 or not block.num_points:
             raise JaxbaError(
                 f"No point is left after round {len(medians)} with a median error of {medians[-1]:.1f} px: the start "
@@ -237,7 +258,6 @@ def adjust(
 
     solved, on_control = onto_control(solved, std_px, reference, control, max_memory, stand)
     standing = None if on_control is None else on_control.standing
-    bars = ScaleBars.nothing() if bars is None else bars
 
     def stand_on_bars(block: Block, use: Bool[np.ndarray, " bars"], factor: float) -> Solved:
         scaled = dataclasses.replace(rounds, anchor=transformed(rounds.anchor, scaling(factor)))
@@ -275,17 +295,17 @@ def adjust(
 
 
 def _compiled(
-    rounds: Rounds, block: Block, tracks: Tracks, *, with_statistics: bool
+    rounds: Rounds, block: Block, tracks: Tracks, stop: threading.Event | None
 ) -> tuple[PlanShape | None, Future[None] | None]:
     """Return the shape of all rounds, None in tiles, and what ends when statistics are compiled, where asked for."""
     whole = rounds.whole(block, tracks)
     if whole is None:
         return None, None
     shape = make_plan(whole, spare=_SPARE).shape
-    if not with_statistics:
+    if stop is None:
         return shape, None
     pool = ThreadPoolExecutor(1, "compile")
-    compiled = pool.submit(statistics_compiler(whole, shape, loss=rounds.loss(1.0), independent="tracks"))
+    compiled = pool.submit(statistics_compiler(whole, shape, loss=rounds.loss(1.0), independent="tracks", stop=stop))
     pool.shutdown(wait=False)
     return shape, compiled
 

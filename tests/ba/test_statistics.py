@@ -1,6 +1,7 @@
 """Redundancy, tests and reliability equal what a dense Jacobian gives, and real adjustments with a row left out."""
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
@@ -154,7 +155,14 @@ def test_statistics_like_an_earlier_plan_are_the_same_and_compile_nothing_more()
     make, loss = CASES["shared camera, every prior"]
     problem = make()
     like = make_plan(problem, spare=0.2).shape
-    statistics_compiler(problem, like, loss=loss, independent="tracks")()
+    stop = threading.Event()
+    compile_all = statistics_compiler(problem, like, loss=loss, independent="tracks", stop=stop)
+    stop.set()
+    begun = _compiler._ahead.cache_info().misses
+    compile_all()
+    assert _compiler._ahead.cache_info().misses == begun  # it was stopped before
+    stop.clear()
+    compile_all()
     compiled = _compiler._ahead.cache_info().misses
     seen = problem.observations
     views = np.bincount(seen.point_index)[seen.point_index]

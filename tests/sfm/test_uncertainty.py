@@ -1,5 +1,7 @@
 """Sigmas follow the errors: all together by their tails, each point by its own."""
 
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +9,9 @@ import pytest
 
 from jaxba.ba import _compiler
 from jaxba.scene import Block
-from jaxba.sfm import Settings, adjust
+from jaxba.sfm import Settings, _adjust, adjust
 from jaxba.sfm._points import apply_points, triangulate_tracks
+from jaxba.sfm._rounds import Rounds
 from jaxba.sfm._spread import spread
 from jaxba.sfm._uncertainty import own_factors, own_variance, uncertainty, with_own_errors
 from jaxba.simulation.staged import Simulated, simulate, true_block
@@ -81,6 +84,25 @@ def test_what_statistics_call_is_compiled_beside_the_rounds() -> None:
     compiled = _compiler._ahead.cache_info().misses
     found = uncertainty(made, survey.reference, with_statistics=True)
     assert found.statistics is not None and _compiler._ahead.cache_info().misses == compiled
+
+
+def test_a_broken_adjustment_compiles_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = simulate(10, seed=5, points_per_image=100.0)
+    stops: list[threading.Event] = []
+
+    def compiler(*_: object, stop: threading.Event, **__: object) -> Callable[[], None]:
+        stops.append(stop)
+        return lambda: None
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_adjust, "statistics_compiler", compiler)
+    monkeypatch.setattr(Rounds, "solve", interrupted)
+    given = (survey.block, survey.tracks, survey.view_graph, survey.reference, survey.photos)
+    with pytest.raises(KeyboardInterrupt):
+        adjust(*given, Settings(), with_statistics=True)
+    assert [stop.is_set() for stop in stops] == [True]
 
 
 def test_long_tails_widen_the_sigmas_and_normal_errors_do_not() -> None:

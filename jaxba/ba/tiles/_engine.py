@@ -9,6 +9,7 @@ Tiles are worked on by threads of this process, or in other processes (`_elsewhe
 order of the tree: the same bytes whatever their number.
 """
 
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -49,14 +50,17 @@ def compile_tiles(
     ones: Iterable[tuple[System, Unknowns]],
     others: Callable[[System, Unknowns, Linearisation], list[Call]],
     at_a_time: int = 2,
+    stop: threading.Event | None = None,
 ) -> None:
     """Compile the work on tiles, so many programs at a time; without it that happens when it is first done.
 
     - `ones`: those of `Engine.one_of_each_shape`. `others`: what is called beside the way up, from a tile's system,
-      unknowns and equations.
+      unknowns and equations. `stop`: once it is set, no further program is begun.
     """
 
     def compile_one(call: Call) -> None:
+        if stop is not None and stop.is_set():
+            return
         with jax.enable_x64(True):  # of this thread
             compile_ahead(call.program, *call.arguments)
 

@@ -8,6 +8,7 @@ Poses are tangent steps (w in rad, v in metres) in the camera's frame, as `Pose.
 import dataclasses
 import functools
 import os
+import threading
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -161,13 +162,19 @@ def marginals_at(
 
 
 def statistics_compiler(
-    problem: Problem, like: PlanShape, *, loss: AbstractLoss | None = None, independent: Independent = "observations"
+    problem: Problem,
+    like: PlanShape,
+    *,
+    loss: AbstractLoss | None = None,
+    independent: Independent = "observations",
+    stop: threading.Event | None = None,
 ) -> Callable[[], None]:
     """Return what compiles that which `statistics` will call, to be called in a thread beside other work.
 
     - `problem`: as it will be by then, but for its values and for observations and points that come and go; where it
       is not, `statistics` compiles as without.
     - `like`: as `statistics` will be given. `loss`, `independent`: likewise.
+    - `stop`: once it is set, no further program is begun; each takes a second or less.
 
     Nothing is compiled for a problem in several tiles, whose shapes are not known before.
 
@@ -184,7 +191,7 @@ def statistics_compiler(
     with opened("statistics", problem, loss, inverse=True, like=like) as engine:
         ones = engine.one_of_each_shape(own_unknowns(problem))
     calls = calls_of_marginals("all", by_tracks=independent == "tracks")
-    return functools.partial(compile_tiles, ones, calls, at_a_time=1)
+    return functools.partial(compile_tiles, ones, calls, at_a_time=1, stop=stop)
 
 
 def _of_photos(label: str, problem: Problem, loss: AbstractLoss, rows: Rows, by_tracks: bool, **room: Any) -> Marginals:

@@ -69,7 +69,7 @@ def test_every_parameter_reaches_the_rounds(simulated: Simulated, monkeypatch: p
     class Reached(Exception):
         pass
 
-    def stop(*given: object) -> None:
+    def stop(*given: object, **_: object) -> None:
         raise Reached(next(value for value in given if isinstance(value, sfm.Settings)))
 
     changed = {

@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 
 from jaxba import __version__
 from jaxba._errors import JaxbaError
-from jaxba.engine._given import Given
 from jaxba.engine._items import Ended, Item, called, late
+from jaxba.engine._remote_call import RemoteCall
 from jaxba.engine._versions import installed
 from jaxba.engine._workers import Resources
 
@@ -45,7 +45,7 @@ class _Begun(NamedTuple):
     """An item that a worker works on: its call, since when, and how long it may take."""
 
     item: Item
-    given: Given
+    call: RemoteCall
     begun_s: float
     seconds: float
 
@@ -99,36 +99,36 @@ class Cluster:
                 for one in list(working):
                     if (ended := self._ended(one, workers)) is not None:
                         working.remove(one)
-                        one.given.take_back()
+                        one.call.take_back()
                         yield one.item, ended
                 for address in _free(workers, working, alone=alone)[: len(waiting)]:
                     item = waiting.popleft()
                     try:
-                        given = Given(self.client, address, called, call, item.arguments)
+                        made = RemoteCall(self.client, address, called, call, item.arguments)
                     except BrokenExecutor:
                         self.workers()  # says what has gone
                         raise
-                    given.fetched.add_done_callback(lambda _: wake.set())
-                    working.append(_Begun(item, given, time.monotonic(), self._resources.seconds_for(item.effort)))
+                    made.fetched.add_done_callback(lambda _: wake.set())
+                    working.append(_Begun(item, made, time.monotonic(), self._resources.seconds_for(item.effort)))
                 wake.wait(_LOOK_S)
         finally:
             for one in working:
-                one.given.take_back()
+                one.call.take_back()
 
     def _ended(self, one: _Begun, workers: dict[str, Any]) -> Ended | None:
         """Return how an item has ended, by itself or since nothing more is to be expected of it; None for the others.
 
         Raises `JaxbaError` where the call could not be made, or stops the run.
         """
-        address = one.given.address
-        if one.given.fetched.done() and not one.given.is_lost():
-            if (error := one.given.raised()) is not None:
+        address = one.call.address
+        if one.call.fetched.done() and not one.call.is_lost():
+            if (error := one.call.fetched.exception()) is not None:
                 raise JaxbaError(f"worker {address}: {type(error).__name__}: {error}")
-            ended: Ended = one.given.fetched.result()
+            ended: Ended = one.call.fetched.result()
             if ended.how == "error":
                 raise JaxbaError(f"{ended.reason} (on the worker {address})")
             return ended
-        if one.given.fetched.done() or address not in workers:
+        if one.call.fetched.done() or address not in workers:
             return Ended("died", None, f"{address} was lost")
         if time.monotonic() - one.begun_s <= one.seconds:
             return None
@@ -252,7 +252,7 @@ def threads_of(workers: dict[str, Any]) -> list[str]:
 
 def _free(workers: dict[str, Any], working: Iterable[_Begun], *, alone: bool) -> list[str]:
     """Return the address of each thread that nothing was given to; of one, where no other item is worked on."""
-    busy = Counter(one.given.address for one in working)
+    busy = Counter(one.call.address for one in working)
     if alone:
         return [] if busy else list(workers)[:1]
     return list((Counter(threads_of(workers)) - busy).elements())

@@ -17,7 +17,7 @@ from typing import Any
 from jaxba._errors import JaxbaError
 from jaxba.engine._cluster import Cluster, cluster, threads_of
 from jaxba.engine._compile_cache import use_compilation_cache
-from jaxba.engine._given import Given
+from jaxba.engine._remote_call import RemoteCall
 from jaxba.engine._workers import Resources
 
 _KEPT_SHARE, _UNLIMITED = 0.5, 4e9  # of a worker's memory; bytes, where none is said
@@ -90,8 +90,8 @@ class _Result(Future[Any]):
         self._places, self._number, self._call, self._lost = places, number, call, 0
         self._given = self._give()
 
-    def _give(self) -> Given:
-        return Given(self._places.engine.client, self._places.find(self._number), _called_there, self._call)
+    def _give(self) -> RemoteCall:
+        return RemoteCall(self._places.engine.client, self._places.find(self._number), _called_there, self._call)
 
     def result(self, timeout: float | None = None) -> Any:
         """Wait for what the call returns, or raises, and see that it comes."""

@@ -15,7 +15,7 @@ from typing import Any
 import distributed
 
 
-class Given:
+class RemoteCall:
     """A call, and the future of its result in this process.
 
     - `address`: the worker's. `fetched`: ends when the result is here, or nothing more is to be expected.
@@ -30,13 +30,6 @@ class Given:
             self.fetched: Future[Any] = asyncio.run_coroutine_threadsafe(_fetch(self._there), loop.asyncio_loop)
         except (OSError, RuntimeError) as error:
             raise BrokenExecutor(str(error)) from error
-
-    def raised(self) -> Exception | None:
-        """Return what an ended call has raised; None where it has returned, or was lost with its worker."""
-        if self.is_lost() or self._there.status != "error":
-            return None
-        error = self.fetched.exception()
-        return error if isinstance(error, Exception) else None
 
     def is_lost(self) -> bool:
         """Return whether an ended call has neither returned nor raised."""

@@ -160,8 +160,8 @@ def settled(system: System, unknowns: Unknowns) -> Unknowns:
 
     def refine(state: tuple[Unknowns, Array, Array, Array]) -> tuple[Unknowns, Array, Array, Array]:
         unknowns, _, now, rounds = state
-        refined = refine_points(system, unknowns, unknowns, jnp.array(True))[0]
-        return refined, now, cost(system, refined), rounds + 1
+        refined = refine_points(system, unknowns, unknowns, jnp.array(True))
+        return refined.unknowns, now, refined.cost, rounds + 1
 
     start = cost(system, unknowns)
     return jax.lax.while_loop(going, refine, (unknowns, jnp.full_like(start, jnp.inf), start, jnp.array(0)))[0]

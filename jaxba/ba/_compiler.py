@@ -52,17 +52,26 @@ def call_compiled(function: Callable[..., Any], *arguments: Any) -> Any:
 
 def compile_ahead(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     """Return what `call_compiled` calls for arguments of these shapes, which may be `jax.ShapeDtypeStruct`s."""
-    return _ahead(function, *_shapes(arguments), platform())
+    return _ahead(function, *shapes_of(arguments), platform())
 
 
 def result_shapes(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return what `call_compiled` would return, a tree of `jax.ShapeDtypeStruct`s; a kept program tells it untraced."""
-    return _program(function, *_shapes(arguments), platform()).result
+    return _program(function, *shapes_of(arguments), platform()).result
 
 
-def _shapes(arguments: tuple[Any, ...]) -> tuple[Any, tuple[tuple[tuple[int, ...], str], ...]]:
+Shapes = tuple[tuple[tuple[int, ...], str], ...]
+
+
+def shapes_of(arguments: Any) -> tuple[Any, Shapes]:
+    """Return the structure of a tree of arrays, numbers or shapes, and shape and type of its leaves."""
     leaves, structure = jax.tree.flatten(arguments)
     return structure, tuple((jax.numpy.shape(leaf), jax.numpy.result_type(leaf).name) for leaf in leaves)
+
+
+def of_shapes(structure: Any, shapes: Shapes) -> Any:
+    """Return the tree of `jax.ShapeDtypeStruct`s that `shapes_of` has taken apart."""
+    return jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
 
 
 @functools.lru_cache(maxsize=64)
@@ -71,11 +80,8 @@ def _ahead(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
 
 
 @functools.lru_cache(maxsize=16)  # each holds what it was lowered to
-def _program(
-    function: Callable[..., Any], structure: Any, shapes: tuple[tuple[tuple[int, ...], str], ...], _: str
-) -> Program:
-    arguments = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
-    return program(function, arguments, compiler_options(), made_from=function)
+def _program(function: Callable[..., Any], structure: Any, shapes: Shapes, _: str) -> Program:
+    return program(function, of_shapes(structure, shapes), compiler_options(), made_from=function)
 
 
 def platform() -> str:

@@ -8,7 +8,7 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,6 +27,8 @@ from jaxba.ba._unknowns import Unknowns
 
 _KEPT = 32
 _SURELY_FREE = 1e8  # bytes
+
+_Unknowns = TypeVar("_Unknowns")
 
 
 class Reached(NamedTuple):
@@ -55,7 +57,7 @@ def descend(
     begun = time.perf_counter()
     plain: System = jax.device_put(without_losses(system))
     run = compiled(solver, start, system, plain)
-    _require_memory(run.step_bytes)
+    require_memory(run.step_bytes)
     compiled_at = time.perf_counter()
 
     def step(unknowns: Unknowns, state: State) -> tuple[Unknowns, State]:
@@ -66,7 +68,7 @@ def descend(
     return Reached(*walked, functools.partial(run.cost, plain), *seconds)
 
 
-def _require_memory(need: float) -> None:
+def require_memory(need: float) -> None:
     """Raise `JaxbaError` where a step needs more memory than is free, in place of XLA's own error."""
     if need < _SURELY_FREE or platform() != "cpu":
         return
@@ -79,15 +81,15 @@ def _require_memory(need: float) -> None:
 
 
 def walk(
-    unknowns: Unknowns,
+    unknowns: _Unknowns,
     state: State,
-    step: Callable[[Unknowns, State], tuple[Unknowns, State]],
+    step: Callable[[_Unknowns, State], tuple[_Unknowns, State]],
     max_nfev: int,
     callback: Callable[[HistoryStep], None] | None = None,
     *,
     before: Sequence[HistoryStep] = (),
-    save: Callable[[Unknowns, State, list[HistoryStep]], None] | None = None,
-) -> tuple[Unknowns, State, list[HistoryStep], bool]:
+    save: Callable[[_Unknowns, State, list[HistoryStep]], None] | None = None,
+) -> tuple[_Unknowns, State, list[HistoryStep], bool]:
     """Step as `descend` does; return where it stopped, what it tried, and whether Ctrl-C ended it.
 
     - `before`: what an earlier call tried, if this one goes on from there. `save`: called after each step.

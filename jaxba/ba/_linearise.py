@@ -97,6 +97,15 @@ def point_costs(system: System, unknowns: Unknowns) -> Float[Array, " points"]:
     return total
 
 
+def cost_with(system: System, unknowns: Unknowns, of_points: Float[Array, " points"]) -> Float[Array, ""]:
+    """Return the cost, as `cost` does, from that of each point (`point_costs`) and the priors that touch no point."""
+    total = jnp.sum(of_points)
+    for prior in system.priors:
+        if prior.rows(unknowns).point is None:
+            total += jnp.sum(prior.loss(sum_components(prior.residual(unknowns) ** 2)))
+    return jnp.where(jnp.isfinite(total), total / 2, jnp.inf)
+
+
 def point_equations(
     system: System, unknowns: Unknowns, bend: Float[Array, ""]
 ) -> tuple[Float[Array, "points 3"], Float[Array, "points 3 3"]]:

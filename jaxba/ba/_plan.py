@@ -17,13 +17,13 @@ Cost: O(observations log observations + pairs log pairs); 0.1 s for 500 images, 
 """
 
 import dataclasses
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import numpy as np
 from jax import Array
 from jax.core import Tracer
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -98,17 +98,9 @@ def make_plan(
     require_number("make_plan: spare", spare, 0.0, 1e3, "give a share of 0 or more, such as 0.1")
     image = np.asarray(problem.observations.image_index)
     point = np.asarray(problem.observations.point_index)
-    free_pose, free_point = np.asarray(problem.free.poses), np.asarray(problem.free.points)
     least = bare_shape(problem, like)
-    own_cameras, block = least.own_cameras, least.block
-
-    coupled = free_point[point] & (free_pose[image] | own_cameras)
-    image_order, bandwidth = _order_images(image[coupled], point[coupled], problem, image_order)
-    solver, panel_images, band_panels = _choose_linear_solver(linear_solver, len(image_order), block, bandwidth)
-    if like is not None and like.block == block and band_panels <= like.band_panels:
-        solver, panel_images, band_panels = like.linear_solver, like.panel_images, like.band_panels
-    num_images = max(bucket(problem.num_images + 1, multiple=panel_images, small=SMALL_IMAGES), least.num_images)
-    num_images = -(-num_images // panel_images) * panel_images
+    layout = lay_out_images(problem, least, linear_solver, like=like, given=image_order)
+    image_order, num_images = layout.order, layout.num_images
 
     rank_of_image = np.empty(problem.num_images, np.int32)
     rank_of_image[image_order] = np.arange(problem.num_images, dtype=np.int32)
@@ -126,7 +118,7 @@ def make_plan(
     num_rows = len(row_observation)
     row_point = np.where(row_observation >= 0, rank_of_point[point[row_observation]], num_points - 1).astype(np.int32)
 
-    use = (row_observation >= 0) & coupled[row_observation]
+    use = (row_observation >= 0) & layout.coupled[row_observation]
     first, second, blocks_of_pairs = _pairs(row_image, row_point, np.flatnonzero(use), num_images)
     runs = _pair_runs(first, second, blocks_of_pairs, num_rows - 1, least.num_pair_runs, spare)
     num_blocks = max(bucket(_more(len(runs.blocks), spare)) if len(runs.blocks) else 0, least.num_blocks)
@@ -139,17 +131,19 @@ def make_plan(
         num_points=num_points,
         num_rows=num_rows,
         chunk_runs=min(CHUNK_RUNS, num_rows // ROW_RUN),
-        num_cameras=num_images if own_cameras else problem.num_cameras,
+        num_cameras=num_images if least.own_cameras else problem.num_cameras,
         num_pair_runs=len(runs.block_of_run),
         num_blocks=num_blocks,
-        linear_solver=solver,
-        panel_images=panel_images,
-        band_panels=band_panels,
+        linear_solver=layout.linear_solver,
+        panel_images=layout.panel_images,
+        band_panels=layout.band_panels,
     )
     return Plan(
         image_order=image_order,
         point_order=point_order,
-        camera_order=np.asarray(problem.camera_index)[image_order] if own_cameras else np.arange(problem.num_cameras),
+        camera_order=np.asarray(problem.camera_index)[image_order]
+        if least.own_cameras
+        else np.arange(problem.num_cameras),
         row_observation=row_observation,
         row_image=row_image,
         row_point=row_point,
@@ -161,6 +155,76 @@ def make_plan(
         block_column=(blocks % num_images).astype(np.int32),
         shape=shape,
     )
+
+
+def widened(plan: Plan, shape: PlanShape) -> Plan:
+    """Return a plan of a larger shape of the same kind, with as many images, as `larger` makes of two plans' shapes."""
+    old, added = plan.shape, shape.num_rows - plan.shape.num_rows
+    last = old.num_rows - 1
+
+    def padded(values: Array | np.ndarray, size: int, fill: int) -> np.ndarray:
+        return np.append(values, np.full(size - len(values), fill, np.int32))
+
+    def pairs(rows: Array | np.ndarray) -> np.ndarray:
+        rows = np.where(np.asarray(rows) == last, last + added, rows).reshape(-1, PAIR_RUN)
+        filled = np.full((shape.num_pair_runs - len(rows), PAIR_RUN), last + added, np.int32)
+        return np.concatenate([rows, filled]).reshape(-1, PAIR_CHUNK, PAIR_RUN)
+
+    no_point, last_image = shape.num_points - 1, shape.num_images - 1
+    return dataclasses.replace(
+        plan,
+        row_observation=padded(plan.row_observation, shape.num_rows, -1),
+        row_image=padded(plan.row_image, shape.num_rows, last_image),
+        row_point=padded(np.where(plan.row_observation < 0, no_point, plan.row_point), shape.num_rows, no_point),
+        point_image=padded(plan.point_image, shape.num_points, 0),
+        pair_first=pairs(plan.pair_first),
+        pair_second=pairs(plan.pair_second),
+        pair_block=padded(plan.pair_block, shape.num_pair_runs, int(plan.pair_block[-1])),
+        block_row=padded(plan.block_row, shape.num_blocks, last_image),
+        block_column=padded(plan.block_column, shape.num_blocks, last_image),
+        shape=dataclasses.replace(shape, chunk_runs=min(CHUNK_RUNS, shape.num_rows // ROW_RUN)),
+    )
+
+
+class ImageLayout(NamedTuple):
+    """How the images stand in the reduced system, and how it is solved.
+
+    - `coupled`: observations whose point and image, or its own camera, are free. `num_images`: with padding.
+    """
+
+    order: Int[np.ndarray, " images"]
+    coupled: Bool[np.ndarray, " observations"]
+    num_images: int
+    linear_solver: Literal["dense", "banded", "cg"]
+    panel_images: int
+    band_panels: int
+
+
+def lay_out_images(
+    problem: Problem,
+    least: PlanShape,
+    linear_solver: LinearSolver,
+    *,
+    like: PlanShape | None = None,
+    given: Int[np.ndarray, " images"] | None = None,
+) -> ImageLayout:
+    """Return how the images of a problem stand in the reduced system; see `make_plan`, whose `image_order` is `given`.
+
+    - `least`: of `bare_shape(problem, like)`.
+    """
+    image, point = np.asarray(problem.observations.image_index), np.asarray(problem.observations.point_index)
+    coupled = np.asarray(problem.free.points)[point]
+    if not least.own_cameras:
+        coupled = coupled & np.asarray(problem.free.poses)[image]
+    if given is not None and linear_solver == "dense":
+        order, bandwidth = given.astype(np.int32), 0
+    else:
+        order, bandwidth = _order_images(image[coupled], point[coupled], problem, given)
+    solver, panel_images, band_panels = _choose_linear_solver(linear_solver, len(order), least.block, bandwidth)
+    if like is not None and like.block == least.block and band_panels <= like.band_panels:
+        solver, panel_images, band_panels = like.linear_solver, like.panel_images, like.band_panels
+    num_images = max(bucket(problem.num_images + 1, multiple=panel_images, small=SMALL_IMAGES), least.num_images)
+    return ImageLayout(order, coupled, -(-num_images // panel_images) * panel_images, solver, panel_images, band_panels)
 
 
 def _more(count: int, spare: float) -> int:

@@ -10,6 +10,8 @@ While steps still change the cost much, sweeps use reweighted least squares, whi
 afterwards most of the loss's curvature, which is fast near it.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.ba._linearise import point_costs, point_equations
+from jaxba.ba._linearise import cost_with, point_costs, point_equations
 from jaxba.ba._rows import rows_of
 from jaxba.ba._schur import solve_points
 from jaxba.ba._system import System
@@ -29,34 +31,48 @@ _SWEEPS, _ROBUST_SWEEPS = 2, 6
 _OUTWARD = 10.0  # with 3 or 5 far points take up to three times the steps, with 100 they end at a higher cost
 
 
-def refine_points(
-    system: System, trial: Unknowns, before: Unknowns, near: Bool[Array, ""]
-) -> tuple[Unknowns, Int[Array, ""]]:
-    """Return `trial` with its points refined, and how many of them had to go back first.
+class Refined(NamedTuple):
+    """Unknowns with refined points, their cost, and how many points had to go back first."""
+
+    unknowns: Unknowns
+    cost: Float[Array, ""]
+    num_held: Int[Array, ""]
+
+
+def refine_points(system: System, trial: Unknowns, before: Unknowns, near: Bool[Array, ""]) -> Refined:
+    """Return `trial` with its points refined.
 
     - `before`: a point that the step has put behind a camera, or where its cost is not finite, first goes back there.
     - `near`: whether steps have become small.
     """
-    costs = point_costs(system, trial)
-    lost = ~jnp.isfinite(costs)
-    trial = _with_points(trial, jnp.where(lost[:, None], before.points, trial.points))
-    costs = jax.lax.cond(jnp.any(lost), lambda: point_costs(system, trial), lambda: costs)
-    bend = jnp.where(near, _NEAR_BEND, 0.0).astype(costs.dtype)
+    dtype = trial.points.dtype
+    bend = jnp.where(near, _NEAR_BEND, 0.0).astype(dtype)
+    sweeps = _SWEEPS if isinstance(system.loss, Linear) else _ROBUST_SWEEPS
 
-    def sweep(state: tuple[Unknowns, Array, Array], _: None) -> tuple[tuple[Unknowns, Array, Array], None]:
-        unknowns, costs, damping = state
-        gradient, hessian = point_equations(system, unknowns, bend)
-        step = -solve_points(system, hessian, gradient, damping)
-        moved = _with_points(unknowns, move_points(system, unknowns, step))
-        moved_costs = point_costs(system, moved)
-        better = moved_costs < costs
-        points = jnp.where(better[:, None], moved.points, unknowns.points)
-        damping = jnp.where(better, jnp.maximum(damping / 10, 1e-10), damping * 10)
-        return (_with_points(unknowns, points), jnp.where(better, moved_costs, costs), damping), None
+    def sweep(state: tuple[Array, ...], number: Array) -> tuple[tuple[Array, ...], None]:
+        """Judge where points may go; -1: where they were, 0: where the step puts them, then where sweeps do."""
+        points, costs, damping, target, num_held = state
+        new_costs = point_costs(system, _with_points(trial, target))
+        better = jnp.where(number > 0, new_costs < costs, jnp.isfinite(new_costs) | (number < 0))
+        points, costs = jnp.where(better[:, None], target, points), jnp.where(better, new_costs, costs)
+        factor = jnp.where(better, jnp.maximum(damping / 10, 1e-10), damping * 10)
+        damping = jnp.where(number > 0, factor, damping)
+        num_held = jnp.where(number == 0, jnp.sum(~better), num_held)
 
-    start = (trial, costs, jnp.full(costs.shape, 1e-4, costs.dtype))
-    refined = jax.lax.scan(sweep, start, length=_SWEEPS if isinstance(system.loss, Linear) else _ROBUST_SWEEPS)[0][0]
-    return refined, jnp.sum(lost)
+        def swept(points: Array) -> Array:
+            unknowns = _with_points(trial, points)
+            gradient, hessian = point_equations(system, unknowns, bend)
+            return move_points(system, unknowns, -solve_points(system, hessian, gradient, damping))
+
+        stays = (number < 0) | (number == sweeps)
+        target = jax.lax.cond(stays, lambda _: jnp.asarray(trial.points), swept, points)
+        return (points, costs, damping, target, num_held), None
+
+    first = jnp.asarray(before.points)
+    start = (first, jnp.zeros(first.shape[0], dtype), jnp.full(first.shape[0], 1e-4, dtype), first, jnp.array(0))
+    (points, costs, *_, num_held), _ = jax.lax.scan(sweep, start, jnp.arange(-1, sweeps + 1))
+    refined = _with_points(trial, points)
+    return Refined(refined, cost_with(system, refined, costs), num_held)
 
 
 def move_points(

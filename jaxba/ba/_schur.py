@@ -71,7 +71,7 @@ def one_for_fixed(system: System, damping: Step) -> Step:
 
 def eliminate(model: Linearisation, damping: Float[Array | np.ndarray, "points 3"]) -> Eliminated:
     """Return the points taken out of `J^T J + diag(damping)`."""
-    root = _inverse_root(model.point_products + _diagonal_matrix(jnp.asarray(damping)))
+    root = _inverse_root(model.point_products + diagonal_matrix(jnp.asarray(damping)))
     return Eliminated(root, model.w, model.point_shared)
 
 
@@ -87,7 +87,7 @@ def eliminate_points(system: System, model: Linearisation, damping: Step) -> Red
     before = model.image_products[:, :columns, :columns]
     vector = to_reduced(system, damping)
     diagonal = before[:, : shape.block, : shape.block] - eliminated[:, :, : shape.block]
-    diagonal += _diagonal_matrix(vector.images)
+    diagonal += diagonal_matrix(vector.images)
     num_shared = shape.border - shape.antenna  # what follows them in `z_shared` is the antenna
     border = -eliminated[:, :, shape.block :]
     flat = z_shared.reshape(3 * shape.num_points, z_shared.shape[-1])
@@ -101,7 +101,7 @@ def eliminate_points(system: System, model: Linearisation, damping: Step) -> Red
         corner = _add_cameras(corner, sum_cameras(system, before[:, 6:, 6:]))
     antenna = shape.border - z_shared.shape[-1]
     border = jnp.pad(border, ((0, 0), (0, 0), (0, antenna)))
-    corner = jnp.pad(corner, ((0, antenna), (0, antenna))) + _diagonal_matrix(vector.border)
+    corner = jnp.pad(corner, ((0, antenna), (0, antenna))) + diagonal_matrix(vector.border)
     diagonal, border, corner = _add_priors(system, model.prior_blocks, diagonal, border, corner)
     return Reduced(diagonal, _sum_pairs(system, z), border, corner, points)
 
@@ -136,7 +136,7 @@ def solve_points(
     """Return `(V + damping diag(V))^-1 b` of every point, zero for fixed ones."""
     diagonal = jnp.diagonal(matrix, axis1=1, axis2=2) * damping[:, None]
     seen = jnp.any(diagonal > 0, axis=1, keepdims=True)
-    root = _inverse_root(matrix + _diagonal_matrix(jnp.where(seen, diagonal, 1.0)))
+    root = _inverse_root(matrix + diagonal_matrix(jnp.where(seen, diagonal, 1.0)))
     return _solve_roots(root, rhs) * system.free.points
 
 
@@ -216,7 +216,8 @@ def _solve_roots(root: Float[Array, "n 6"], vectors: Float[Array, "n 3"]) -> Flo
     return jnp.stack([r[0] * u + r[1] * v + r[3] * w, r[2] * v + r[4] * w, r[5] * w], axis=-1)
 
 
-def _diagonal_matrix(diagonal: Float[Array, "*n k"]) -> Float[Array, "*n k k"]:
+def diagonal_matrix(diagonal: Float[Array, "*n k"]) -> Float[Array, "*n k k"]:
+    """Return matrices with these diagonals."""
     return diagonal[..., None] * jnp.eye(diagonal.shape[-1], dtype=diagonal.dtype)
 
 

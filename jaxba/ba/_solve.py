@@ -18,6 +18,7 @@ from jaxba._errors import JaxbaError
 from jaxba.ba._adjoint import Adjoint
 from jaxba.ba._descend import descend
 from jaxba.ba._plan import LinearSolver, Plan
+from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solvers import AbstractSchurSolver, SchurDogleg, SchurLevenbergMarquardt, require_stops
@@ -33,7 +34,8 @@ from jaxba.ba._system import (
 )
 from jaxba.ba._traced import solve_traced
 from jaxba.ba._unknowns import Unknowns
-from jaxba.ba.checks import Prepared
+from jaxba.ba.checks import Prepared, prepare
+from jaxba.ba.parts._solve import is_for_parts, solve_in_parts
 from jaxba.ba.tiles._solve_tiled import in_tiles
 from jaxba.geometry import AbstractLoss, Linear, check_loss
 
@@ -57,7 +59,7 @@ def solve(
     xtol: float = 1e-8,
     gtol: float = 1e-10,
     dtype: Any = np.float64,
-    plan: Plan | None = None,
+    plan: Plan | PlanShape | None = None,
     adjoint: Adjoint = "implicit",
     callback: Callable[[HistoryStep], None] | None = None,
 ) -> Solution:
@@ -71,7 +73,8 @@ def solve(
       unknowns together move what the images see by less than so many radians. `gtol`: when no entry of the gradient is
       larger, as in scipy.
     - `plan`: the problem's structure, made by `make_plan`; needed where the problem's indices are traced. Where
-      something is left out of the problem, a new plan of the same sizes takes its place.
+      something is left out of the problem, a new plan of the same sizes takes its place. A plan's shape in its place
+      gives the least sizes, so that like problems share what is compiled.
     - `adjoint`: how derivatives are taken. `implicit`: of the optimum, exact. `gauss_newton`: the same with J^T J in
       place of the second derivatives, off by as much as residuals and losses bend. `unrolled`: backwards through the
       solver's steps, whose memory grows with their number; reverse mode alone, without bounds.
@@ -121,13 +124,15 @@ def _solve_on_host(
     problem: Problem,
     loss: AbstractLoss,
     solver: AbstractSchurSolver,
-    plan: Plan | None,
+    plan: Plan | PlanShape | None,
     linear_solver: LinearSolver,
     max_nfev: int,
     dtype: Any,
     callback: Callable[[HistoryStep], None] | None,
 ) -> Solution:
     begun = time.perf_counter()
+    if not isinstance(plan, Plan) and is_for_parts(problem, solver, linear_solver):
+        return solve_in_parts(prepare(problem), plan, linear_solver, loss, solver, max_nfev, dtype, callback, begun)
     prepared, plan = structured(problem, plan, linear_solver)
     return solve_prepared(prepared, plan, loss, solver, max_nfev, dtype, callback, begun)
 

@@ -194,11 +194,11 @@ class AbstractSchurSolver(optx.AbstractLeastSquaresSolver[Unknowns, Any, Any, St
         system = args
         model = linearise(system, y, state.bend)
         step, linear_iterations, shortened = self.propose(system, y, model, state.trust)
-        step = _within_bounds(system, y, step)
+        step = within_bounds(system, y, step)
         moved = eqx.tree_at(lambda u: u.points, y.retract(step), move_points(system, y, step.points))
-        trial, points_held = refine_points(system, moved, y, state.bend > 0)
+        trial, cost_of_trial, points_held = refine_points(system, moved, y, state.bend > 0)
         tried = Tried(
-            cost=cost(system, trial),
+            cost=cost_of_trial,
             promised=-slope_along(model.gradient, step) - curvature(system, model, step) / 2,
             gradient_norm=projected_gradient_norm(system.lower, system.upper, y.intrinsics, model.gradient),
             shortened=shortened,
@@ -312,7 +312,7 @@ class SchurDogleg(AbstractSchurSolver):
         finite = jnp.isfinite(norm_of(newton))
         scale = damping_scale(model.diagonal)
         descent = jax.tree.map(lambda g, d, free: -free * g / d, model.gradient, scale, system.free)
-        descent = _within_bounds(system, unknowns, descent)
+        descent = within_bounds(system, unknowns, descent)
         bent = curvature(system, model, descent)
         length = jnp.where(bent > 0, -slope_along(model.gradient, descent) / bent, 1.0)
         cauchy = jax.tree.map(lambda d: length * d, descent)
@@ -386,7 +386,8 @@ def step_bounds(system: System, unknowns: Unknowns) -> tuple[Array | None, Array
     return border(system.lower, -infinite), border(system.upper, infinite)
 
 
-def _within_bounds(system: System, unknowns: Unknowns, step: Step) -> Step:
+def within_bounds(system: System, unknowns: Unknowns, step: Step) -> Step:
+    """Return a step that takes no intrinsic beyond its bounds."""
     if not system.shape.any_bound:
         return step
     moved = jnp.clip(unknowns.intrinsics + step.intrinsics, system.lower, system.upper)

@@ -50,15 +50,16 @@ class System(eqx.Module):
     shape: PlanShape = eqx.field(static=True)
 
 
-def structured(problem: Problem, plan: Plan | None, linear_solver: LinearSolver) -> tuple[Prepared, Plan]:
+def structured(problem: Problem, plan: Plan | PlanShape | None, linear_solver: LinearSolver) -> tuple[Prepared, Plan]:
     """Return what can be solved of a problem whose values are known, and its plan.
 
-    A plan that was given stands unless something was left out; then its shape gives the least sizes of a new one.
+    A plan that was given stands unless something was left out. Then its shape gives the least sizes of a new one, as
+    a shape alone does.
     Raises `JaxbaError` as `prepare` does.
     """
     prepared = prepare(problem)
-    if plan is None or prepared.dropped.any():
-        like = None if plan is None else plan.shape
+    if not isinstance(plan, Plan) or prepared.dropped.any():
+        like = plan.shape if isinstance(plan, Plan) else plan
         plan = make_plan(prepared.problem, linear_solver=linear_solver, like=like)
     return prepared, plan
 

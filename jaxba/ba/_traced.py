@@ -23,6 +23,7 @@ from jaxba.ba._adjoint import Adjoint, Found, optimum, polish
 from jaxba.ba._descend import descend
 from jaxba.ba._linearise import costs
 from jaxba.ba._plan import LinearSolver, Plan, make_plan
+from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Solution
 from jaxba.ba._solvers import AbstractSchurSolver, SchurLevenbergMarquardt, residuals
@@ -41,7 +42,7 @@ def solve_traced(
     problem: Problem,
     loss: AbstractLoss,
     solver: AbstractSchurSolver,
-    plan: Plan | None,
+    plan: Plan | PlanShape | None,
     linear_solver: LinearSolver,
     adjoint: Adjoint,
     max_nfev: int,
@@ -91,13 +92,13 @@ def solve_to_the_last_digits(
     return Solution.of(problem, values, costs, reached.state.status, reached.state.num_steps)
 
 
-def _structure(problem: Problem, plan: Plan | None, linear_solver: LinearSolver) -> tuple[Problem, Plan]:
+def _structure(problem: Problem, plan: Plan | PlanShape | None, linear_solver: LinearSolver) -> tuple[Problem, Plan]:
     """Return the problem that can be solved, as far as its values are known, and its plan."""
     if not is_traced(problem):
         prepared, plan = structured(problem, plan, linear_solver)
         return prepared.problem, plan
     indices = (problem.observations.image_index, problem.observations.point_index, problem.camera_index, problem.free)
-    if plan is None:
+    if not isinstance(plan, Plan):
         if is_traced((indices, problem.lower, problem.upper)):
             raise JaxbaError(
                 "solve: the problem's indices are traced, as arguments of jit are; give it "

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba.ba import HistoryStep, PlanShape, Problem, Solution, make_plan, reprojection_errors, solve, solve_tiled
+from jaxba.ba import HistoryStep, PlanShape, Problem, Solution, reprojection_errors, solve, solve_tiled
 from jaxba.geometry import CAMERAS, LOSSES, AbstractLoss, Linear
 from jaxba.scene import Block, Control, Photo, Reference, ScaleBars, Tracks
 from jaxba.sfm._measured import position_scale
@@ -162,7 +162,7 @@ class Rounds:
                     tiles |= {"executors": crew[0], "executor_memory": crew[1]}
                 solution = solve_tiled(problem, loss=loss, callback=told.step, on_tile=told.tile, **tiles, **stops)
         else:
-            solution = solve(problem, loss=loss, plan=make_plan(problem, like=shape), **stops)
+            solution = solve(problem, loss=loss, plan=shape, **stops)
         if solution.result == "interrupted":
             raise KeyboardInterrupt  # the solver hands on what it reached; rounds go on from an optimum alone
         num_points, num_own = block.num_points, block.num_observations

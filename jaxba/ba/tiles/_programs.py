@@ -15,7 +15,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.ba._lengths import all_squared_in_sigmas, slope_along, squared_in_sigmas
-from jaxba.ba._linearise import Linearisation, cost, curvature
+from jaxba.ba._linearise import Linearisation, curvature
 from jaxba.ba._refine import move_points, refine_points
 from jaxba.ba._schur import (
     ReducedVector,
@@ -137,9 +137,9 @@ def put_back(
     whole = back_substitute(system, points, jax.tree.map(jnp.negative, model.gradient), solution)
     step = eqx.tree_at(lambda s: s.points, step, whole.points)
     moved = eqx.tree_at(lambda u: u.points, unknowns.retract(step), move_points(system, unknowns, step.points))
-    trial, held = refine_points(system, moved, unknowns, bend > 0)
+    trial, cost, held = refine_points(system, moved, unknowns, bend > 0)
     sums = Sums(
-        cost=cost(system, trial),
+        cost=cost,
         slope=slope_along(model.gradient, step),
         curvature=curvature(system, model, step),
         in_sigmas=squared_in_sigmas(model, step),

@@ -193,6 +193,11 @@ def without_losses(system: System) -> System:
     return dataclasses.replace(system, loss=Linear(), priors=linear)
 
 
+def has_sigmas(prior: AbstractPrior) -> bool:
+    """Return whether a prior can be filled up with rows that weigh nothing."""
+    return any(field.name.startswith("std") for field in dataclasses.fields(prior))
+
+
 def is_traced(tree: Any) -> bool:
     """Whether any leaf is a tracer of jax's."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
@@ -236,7 +241,7 @@ def _reordered(xp: Any, prior: AbstractPrior, rows: int, plan: Plan, dtype: Any)
         "point_index": xp.argsort(plan.point_order),
         "camera_index": xp.argsort(plan.camera_order),
     }
-    has_sigmas = any(field.name.startswith("std") for field in dataclasses.fields(prior))
+    padded = has_sigmas(prior)
     changed: dict[str, Any] = {}
     for field in dataclasses.fields(prior):
         value = getattr(prior, field.name)
@@ -250,5 +255,5 @@ def _reordered(xp: Any, prior: AbstractPrior, rows: int, plan: Plan, dtype: Any)
         value = xp.asarray(ranks[field.name], of)[value] if field.name in ranks else xp.asarray(value, of)
         count = value.shape[0]
         fill = np.inf if field.name.startswith("std") else None if count else 0.0 if is_index else 1.0
-        changed[field.name] = _padded(xp, value, np.arange(count), rows if has_sigmas else count, fill, of)
+        changed[field.name] = _padded(xp, value, np.arange(count), rows if padded else count, fill, of)
     return dataclasses.replace(prior, **changed)

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxba import JaxbaError, solve, solve_tiled
-from jaxba.ba import HistoryStep, _descend, make_plan
+from jaxba.ba import HistoryStep, _descend
 from jaxba.scene import Block, Tracks
 from jaxba.sfm import Adjusted, Settings, Tiling, Uncertainty, _rounds, adjust, uncertainty
 from jaxba.sfm._edges import match_rows, without_edges
@@ -179,7 +179,7 @@ def test_early_rounds_end_early_and_the_last_at_the_optimum(clean: Simulated, mo
     ends = [options["ftol"] for options in solves]
     assert ends[0] == 1e-4 and ends[-1] == Settings().ftol and set(ends) == {1e-4, Settings().ftol}
     assert len(ends) == len(found.medians_px) + 1  # the round that settled went on
-    plan = make_plan(found.problem, like=solves[-1]["plan"].shape)  # whose program is there
+    plan = solves[-1]["plan"]  # whose programs are there
     history = solve(found.problem, loss=found.loss, plan=plan, ftol=1e-13, xtol=1e-12).report.history
     assert history[0].cost - history[-1].cost < 1e-9 * history[0].cost
 

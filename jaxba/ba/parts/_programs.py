@@ -103,7 +103,7 @@ def judge(
 
     - `numbers`: of `SchurLevenbergMarquardt`, see `take_numbers`. `sums`: of all parts.
     """
-    total = Sums(*(sum_all(of_parts) for of_parts in zip(*sums, strict=True)))
+    total = Sums(*(functools.reduce(jnp.add, of_parts) for of_parts in zip(*sums, strict=True)))
     tried = Tried(
         cost=jnp.asarray(total.cost),
         promised=jnp.asarray(-total.slope - total.curvature / 2),

@@ -22,7 +22,7 @@ from jaxba.ba._plan_shape import PlanShape
 from jaxba.ba._problem import Problem
 from jaxba.ba._solution import HistoryStep, Report, Solution
 from jaxba.ba._solvers import AbstractSchurSolver, SchurLevenbergMarquardt, State, take_numbers
-from jaxba.ba._system import centred, from_centred, own_unknowns
+from jaxba.ba._system import centred, from_centred, has_sigmas, own_unknowns
 from jaxba.ba._unknowns import Unknowns
 from jaxba.ba.checks import Prepared
 from jaxba.ba.parts._deal import Dealt, deal_out
@@ -37,7 +37,7 @@ _LEAST_OBSERVATIONS = 8192  # with fewer, a step takes some milliseconds in one 
 def is_for_parts(problem: Problem, solver: AbstractSchurSolver, linear_solver: LinearSolver) -> bool:
     """Return whether a problem is solved in parts: it does not depend on the number of cores, nor do the results."""
     usual = isinstance(solver, SchurLevenbergMarquardt) and linear_solver != "cg" and platform() == "cpu"
-    return usual and problem.num_observations >= _LEAST_OBSERVATIONS
+    return usual and problem.num_observations >= _LEAST_OBSERVATIONS and all(map(has_sigmas, problem.priors))
 
 
 def solve_in_parts(
@@ -108,10 +108,10 @@ class _Stepper:
         self._run = _compiled(dealt, start)
         self.step_bytes = len(start) * max(_bytes(self._run.up), _bytes(self._run.down))
 
-    def costs(self, unknowns: tuple[Unknowns, ...]) -> tuple[np.ndarray, np.ndarray]:
+    def costs(self, unknowns: tuple[Unknowns, ...]) -> tuple[np.ndarray, ...]:
         """Return the cost and the plain cost, see `_linearise.costs`."""
         found = self._each(lambda number: self._run.costs(self._dealt.parts[number].system, unknowns[number]))
-        return np.sum([own[0] for own in found]), np.sum([own[1] for own in found])
+        return tuple(np.asarray(sum(np.asarray(own[which]) for own in found)) for which in (0, 1))
 
     def step(self, unknowns: tuple[Unknowns, ...], state: State) -> tuple[tuple[Unknowns, ...], State]:
         """Return the unknowns and the state after a step was tried."""

@@ -5,7 +5,7 @@ leaves the lines of a flight apart. Their features say which others look most li
 
 Of simulated photos in lines of 60% side overlap, 30 that look alike and the 20 before and after hold all verified pairs
 of the half with more matches, also where names say nothing (`python -m benchmarks.retrieval`); 20 that look alike miss
-0 to 2% of them.
+1 or 2% of them.
 """
 
 from collections.abc import Mapping

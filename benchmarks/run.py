@@ -4,7 +4,7 @@ Speed: each case is solved by all solvers in turn, `--repeats` times over, in on
 more before, to compile. The figure is the time until a step first brings a cost within 0.1% of the best final cost that
 any solver reached, preprocessing included, building the problem and compiling left out; the median over the repeats.
 Final costs are those of `benchmarks.cost`, from the values that each solver returned. Memory and the first call are
-measured in a process for each.
+measured in a process for each. A solver that cannot do a case is left out of it, and the last lines say why.
 """
 
 import argparse
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", choices=["speed"], default="speed", help="which benchmark")
     parser.add_argument("--sizes", default="100,500,2000", help="numbers of images of the synthetic blocks")
     parser.add_argument("--cases", default="", help="names of cases, e.g. bal21,uav500_outliers; all by default")
-    parser.add_argument("--solvers", default="jaxba,ceres", help="of jaxba, ceres, scipy")
+    parser.add_argument("--solvers", default="jaxba,ceres", help="of jaxba, ceres, gtsam, scipy")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--max-nfev", type=int, default=100, help="most steps of each solver")
     parser.add_argument("--scipy-seconds", type=float, default=60.0, help="scipy is stopped after this time")
@@ -48,21 +48,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"cases {', '.join(unknown)}: choose from {', '.join(cases)}, or add a size with --sizes.")
     RESULTS.mkdir(exist_ok=True)
     print(_HEADER)
+    left_out: dict[str, list[str]] = {}
     for name in names:
         result = run_case(cases[name], options)
-        (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        if result["solvers"]:
+            (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
         for row in result["solvers"]:
             print(_line(result, row), flush=True)
+        for solver, reason in result["left_out"].items():
+            left_out.setdefault(f"{solver} is left out: {reason}.", []).append(name)
+    for reason, cases_of in left_out.items():
+        print(f"\n{', '.join(cases_of)}: {reason}")
 
 
 def run_case(case: Any, options: argparse.Namespace) -> dict[str, Any]:
-    """Return sizes, versions and one entry a solver, ready for JSON."""
+    """Return sizes, versions, one entry a solver and why others are left out, ready for JSON."""
     from benchmarks.cost import cost_of
     from benchmarks.memory import measure
-    from benchmarks.solvers import solver
+    from benchmarks.solvers import solver, why_left_out
 
     problem = case.make()
-    names = options.solvers.split(",")
+    asked = options.solvers.split(",")
+    left_out = {name: why for name in asked if (why := why_left_out(name, problem, case.loss))}
+    names = [name for name in asked if name not in left_out]
     solvers = {name: solver(name, max_nfev=options.max_nfev, scipy_seconds=options.scipy_seconds) for name in names}
     load_before = os.getloadavg()[0]
     compile_s = solvers["jaxba"](problem, case.loss).seconds_compile if "jaxba" in solvers else 0.0
@@ -72,7 +80,7 @@ def run_case(case: Any, options: argparse.Namespace) -> dict[str, Any]:
             if name != "scipy" or not records[name]:  # scipy once: minutes
                 records[name].append(solve(problem, case.loss))
     costs = {name: cost_of(problem, case.loss, runs[-1].values) for name, runs in records.items()}
-    target = WITHIN * min(costs.values())
+    target = WITHIN * min(costs.values()) if costs else None
     entries = []
     for name, runs in records.items():
         last = runs[-1]
@@ -113,8 +121,9 @@ def run_case(case: Any, options: argparse.Namespace) -> dict[str, Any]:
         "target_cost": target,
         "versions": {
             "python": platform.python_version(),
-            **{name: version(name) for name in _LIBRARIES},
+            **{name: version(name) for name in (*_LIBRARIES, *(name for name in names if name == "gtsam"))},
         },
+        "left_out": left_out,
         "solvers": entries,
     }
 

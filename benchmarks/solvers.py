@@ -16,18 +16,33 @@ Solver = Callable[[Problem, AbstractLoss], Record]
 
 
 def solver(name: str, *, max_nfev: int = 100, scipy_seconds: float = 60.0) -> Solver:
-    """Return `jaxba`, `ceres` or `scipy`, each told to stop after `max_nfev` steps."""
+    """Return `jaxba`, `ceres`, `gtsam` or `scipy`, each told to stop after `max_nfev` steps."""
     if name == "jaxba":
         return functools.partial(solve_with_jaxba, max_nfev=max_nfev)
     if name == "ceres":
         from benchmarks.peers.ceres import solve_with_ceres
 
         return functools.partial(solve_with_ceres, max_num_iterations=max_nfev)
+    if name == "gtsam":
+        from benchmarks.peers.gtsam_lm import solve_with_gtsam
+
+        return functools.partial(solve_with_gtsam, max_num_iterations=max_nfev)
     if name == "scipy":
         from benchmarks.peers.scipy_trf import solve_with_scipy
 
         return functools.partial(solve_with_scipy, max_nfev=max_nfev, time_limit_s=scipy_seconds)
-    raise ValueError(f"solver {name!r}: choose from jaxba, ceres, scipy.")
+    raise ValueError(f"solver {name!r}: choose from jaxba, ceres, gtsam, scipy.")
+
+
+def why_left_out(name: str, problem: Problem, loss: AbstractLoss) -> str | None:
+    """Return why a side does not solve a problem here, in words, or None."""
+    if name != "gtsam":
+        return None
+    try:
+        from benchmarks.peers import gtsam_lm
+    except ImportError as error:
+        return f"gtsam cannot be imported ({error}); install the extra benchmarks, its wheels are for Linux and macOS"
+    return gtsam_lm.why_left_out(problem, loss)
 
 
 def solve_with_jaxba(problem: Problem, loss: AbstractLoss, *, max_nfev: int = 100) -> Record:

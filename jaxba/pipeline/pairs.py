@@ -64,7 +64,7 @@ class Params(Parameters):
     min_partners: int = parameter(6, low=1, high=100, help="nearest photos that are partners whatever their footprint")
     neighbours: int = parameter(20, low=2, high=500, help="nearest photos, where heights above ground are unknown")
     exhaustive_limit: int = parameter(
-        150, low=2, high=5000, help="photos up to which those without a position are paired with all others"
+        60, low=2, high=5000, help="photos up to which those without a position are paired with all others"
     )
     window: int = parameter(20, low=1, high=1000, help="photos before and after that sequential pairs reach")
 

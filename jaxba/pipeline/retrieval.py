@@ -2,6 +2,10 @@
 
 Beyond `pairs.exhaustive_limit` photos those without a usable position are paired with those near in time or name, which
 leaves the lines of a flight apart. Their features say which others look most like them, whatever was in between.
+
+Of simulated photos in lines of 60% side overlap, 30 that look alike and the 20 before and after hold all verified pairs
+of the half with more matches, also where names say nothing (`python -m benchmarks.retrieval`); 20 that look alike miss
+1 or 2% of them.
 """
 
 from collections.abc import Mapping
@@ -34,7 +38,7 @@ class Params(Parameters):
     """What the user may set."""
 
     neighbours: int = parameter(
-        20, low=0, high=500, help="photos that look most like one without a position are its partners; 0: none are"
+        30, low=0, high=500, help="photos that look most like one without a position are its partners; 0: none are"
     )
 
 

@@ -203,7 +203,7 @@ def test_a_photo_without_position_meets_all_of_a_small_set_or_its_neighbours_in_
     assert np.sum(outputs.pairs == 30) == expected
     assert np.isnan(outputs.overlap[(outputs.pairs == 30).any(axis=1)]).all()
     assert any("without a usable position: 1;" in note for note in outputs.notes)
-    assert outputs.by_order.tolist() == ([30] if count > 150 else [])
+    assert outputs.by_order.tolist() == ([30] if count > 60 else [])
 
 
 def test_without_positions_a_small_set_is_paired_in_full():

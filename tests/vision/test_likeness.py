@@ -43,6 +43,20 @@ def test_images_of_the_same_ground_are_alike(detector: str) -> None:
     np.testing.assert_array_equal(found, alike_pairs(features, np.arange(NUM), 4))
 
 
+def test_matches_tell_the_same_ground_from_the_same_texture() -> None:
+    # breaks where vectors alone choose: images of one texture, a field's, are more alike than two of one place
+    rng = np.random.default_rng(0)
+    textures = sift_like(rng, 150), sift_like(rng, 150)
+    features = {}
+    for pair in range(6):  # images 2 k and 2 k + 1 see one place, in different textures
+        ground = sift_like(rng, 80)
+        for side, texture in enumerate(textures):
+            seen = np.clip(np.concatenate([ground, texture, texture]) + rng.normal(0, 4, (380, 128)), 0, 255)
+            features[2 * pair + side] = features_of(seen.astype(np.uint8)[rng.permutation(380)])
+    found = alike_pairs(features, np.arange(12), 3)
+    assert {(k, k + 1) for k in range(0, 12, 2)} <= set(map(tuple, found.tolist()))
+
+
 def test_partners_are_looked_for_of_the_images_asked_for_alone() -> None:
     features = strip("sift")
     empty = features_of(np.zeros((0, 128), np.uint8))

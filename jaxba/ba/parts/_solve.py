@@ -62,9 +62,10 @@ def solve_in_parts(
         own = own_unknowns(near)
         start: tuple[Unknowns, ...] = jax.device_put(tuple(part.take(own, dtype) for part in dealt.parts))
         set_up = time.perf_counter()
-        stepper = _Stepper(dealt, solver, start, pool)
-        require_memory(stepper.step_bytes)
+        run = _compile(len(start), *shapes_of((dealt.parts[0].system, start[0], dealt.joint)), platform())
+        require_memory(run.step_bytes)
         compiled = time.perf_counter()
+        stepper = _Stepper(dealt, run, take_numbers(solver, dtype)[0], pool)
         first = stepper.costs(start)
         state = jax.device_put(jax.tree.map(np.asarray, solver.state_of(jax.numpy.asarray(first[0]))))
         found, state, history, interrupted = walk(start, state, stepper.step, max_nfev, callback)
@@ -85,28 +86,24 @@ def solve_in_parts(
 
 
 class _Programs(NamedTuple):
-    """What a step calls, compiled."""
+    """What a step calls, compiled.
+
+    - `step_bytes`: what a step takes beside its arguments.
+    """
 
     up: Callable[..., Any]
     joint: Callable[..., Any]
     down: Callable[..., Any]
     judge: Callable[..., Any]
     costs: Callable[..., Any]
+    step_bytes: float
 
 
 class _Stepper:
-    """Takes steps of a problem in parts, with what it calls compiled.
+    """Takes steps of a problem in parts."""
 
-    - `step_bytes`: what a step takes beside its arguments.
-    """
-
-    def __init__(
-        self, dealt: Dealt, solver: AbstractSchurSolver, start: tuple[Unknowns, ...], pool: ThreadPoolExecutor
-    ) -> None:
-        self._dealt, self._pool = dealt, pool
-        self._numbers, _ = take_numbers(solver, start[0].points.dtype)
-        self._run = _compiled(dealt, start)
-        self.step_bytes = len(start) * max(_bytes(self._run.up), _bytes(self._run.down))
+    def __init__(self, dealt: Dealt, run: _Programs, numbers: AbstractSchurSolver, pool: ThreadPoolExecutor) -> None:
+        self._dealt, self._run, self._numbers, self._pool = dealt, run, numbers, pool
 
     def costs(self, unknowns: tuple[Unknowns, ...]) -> tuple[np.ndarray, ...]:
         """Return the cost and the plain cost, see `_linearise.costs`."""
@@ -137,12 +134,6 @@ class _Stepper:
         return list(self._pool.map(one, range(len(self._dealt.parts))))
 
 
-def _compiled(dealt: Dealt, start: tuple[Unknowns, ...]) -> _Programs:
-    """Return what steps of a problem in parts call, from these unknowns."""
-    arguments = dealt.parts[0].system, start[0], dealt.joint
-    return _compile(len(start), *shapes_of(arguments), platform())
-
-
 @functools.lru_cache(maxsize=32)
 def _compile(count: int, structure: Any, shapes: Shapes, _: str) -> _Programs:
     """Compile each program in a thread while the next is traced."""
@@ -166,7 +157,8 @@ def _compile(count: int, structure: Any, shapes: Shapes, _: str) -> _Programs:
         (cost, _), of_costs = begin(costs, system, part)
         state = jax.eval_shape(SchurLevenbergMarquardt().state_of, cost)
         _, judging = begin(judge, numbers, state, of_joint, (sums,) * count, scalar)
-        return _Programs(*(future.result() for future in (up, solving, down, judging, of_costs)))
+        made = [future.result() for future in (up, solving, down, judging, of_costs)]
+    return _Programs(*made, step_bytes=count * max(_bytes(made[0]), _bytes(made[2])))
 
 
 def _without_points(unknowns: Unknowns) -> Unknowns:

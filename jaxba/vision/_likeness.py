@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.cluster.vq import kmeans2
 
-from jaxba.scene import Features, rising_pairs
-from jaxba.vision._nearest import signed_bits, unit_descriptors
+from jaxba.scene import Features, descriptor_vectors, rising_pairs
 
 _WORDS, _ROUNDS = 64, 10
 _BEST = 1500  # descriptors of an image
@@ -47,8 +46,7 @@ def alike_pairs(features: Mapping[int, Features], images: Int[np.ndarray, " n"],
 
 
 def _best(features: Features) -> Float[np.ndarray, "rows length"]:
-    best = np.asarray(features.descriptors[:_BEST])
-    return unit_descriptors(best) if features.detector == "sift" else signed_bits(best)
+    return descriptor_vectors(np.asarray(features.descriptors[:_BEST]), features.kind)
 
 
 def _words(features: Mapping[int, Features], images: Int[np.ndarray, " n"]) -> Float[np.ndarray, "words length"]:

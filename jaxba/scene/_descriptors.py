@@ -1,0 +1,55 @@
+"""Kinds of descriptors: by which detector, how they lie in bytes, and how two are compared.
+
+| kind | of | bytes | as a vector | distance, p the product of two vectors |
+| --- | --- | --- | --- | --- |
+| histogram | SIFT | counts | square roots of the shares, of unit length | sqrt(2 - 2 p) |
+| bits | ORB, AKAZE | eight bits each | n numbers 1 and -1 | (n - p) / 2, the Hamming distance, exactly |
+
+The square roots are those of Arandjelovic and Zisserman (2012), "Three things everyone should know".
+"""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+Detector = Literal["sift", "orb", "akaze"]
+DescriptorKind = Literal["histogram", "bits"]
+
+KIND_OF: dict[Detector, DescriptorKind] = {"sift": "histogram", "orb": "bits", "akaze": "bits"}
+
+
+def descriptor_vectors(
+    descriptors: UInt8[np.ndarray, "rows bytes"], kind: DescriptorKind
+) -> Float[np.ndarray, "rows length"]:
+    """Return descriptors as vectors, float32, whose products tell their distances.
+
+    >>> descriptor_vectors(np.array([[9, 16, 0, 0]], np.uint8), "histogram").tolist()
+    [[0.6000000238418579, 0.800000011920929, 0.0, 0.0]]
+    >>> descriptor_vectors(np.array([[5]], np.uint8), "bits").tolist()
+    [[-1.0, -1.0, -1.0, -1.0, -1.0, 1.0, -1.0, 1.0]]
+    """
+    if kind == "bits":
+        return 2.0 * np.unpackbits(descriptors, axis=1).astype(np.float32) - 1.0
+    total = np.maximum(descriptors.sum(axis=1, dtype=np.int64), 1).astype(np.float32)
+    return np.sqrt(descriptors / total[:, None], dtype=np.float32)
+
+
+def distances_of_products(
+    products: Float[np.ndarray, " n"], length: int, kind: DescriptorKind
+) -> Float[np.ndarray, " n"]:
+    """Return the distances of descriptors, by the products of their vectors of this length."""
+    if kind == "bits":
+        return (length - products.astype(np.float64)) / 2
+    return np.sqrt(np.maximum(2.0 - 2.0 * products.astype(np.float64), 0.0))
+
+
+def descriptor_distances(
+    first: UInt8[np.ndarray, "n bytes"], second: UInt8[np.ndarray, "n bytes"], kind: DescriptorKind
+) -> Float[np.ndarray, " n"]:
+    """Return the distance of each descriptor from the one in the same row, without making vectors of them."""
+    if kind == "bits":
+        return np.bitwise_count(first ^ second).sum(axis=1, dtype=np.float64)
+    product = np.sqrt(first.astype(np.float32) * second).sum(axis=1, dtype=np.float64)
+    total = first.sum(axis=1, dtype=np.float64) * second.sum(axis=1, dtype=np.float64)
+    return np.sqrt(np.maximum(2 - 2 * product / np.sqrt(np.maximum(total, 1.0)), 0.0))

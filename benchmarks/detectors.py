@@ -74,11 +74,15 @@ def line(name: str, detector: str, row: dict[str, Any]) -> str:
     if adjust is None:
         cells = [row["stopped"]["reason"], pairs, "", "", ""]
     else:
-        fit = "none" if adjust["gnss_rms_m"] is None else ", ".join(f"{rms:.2f}" for rms in adjust["gnss_rms_m"])
+        fit = ", ".join(_number(rms) for rms in adjust["gnss_rms_m"] or [None])
         adjusted = f"{adjust['images']} of {adjust['photos']}"
-        cells = [adjusted, pairs, str(adjust["points_seen_thrice"]), f"{adjust['median_px']:.2f}", fit]
+        cells = [adjusted, pairs, str(adjust["points_seen_thrice"]), _number(adjust["median_px"]), fit]
     cells = [name, detector, *cells, f"{row['seconds']:.0f}", f"{row['cpu_seconds']:.0f}"]
     return f"| {' | '.join(cells)} |"
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.2f}"
 
 
 _WEAK, _REJECTED = ("min_good", "min_inlier_ratio"), ("matches", "verified")

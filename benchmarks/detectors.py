@@ -1,8 +1,8 @@
-"""SIFT beside ORB on the same photos: `python -m benchmarks.detectors brighton seneca40 copr`.
+"""SIFT beside other detectors on the same photos: `python -m benchmarks.detectors brighton seneca40 copr`.
 
 Each runs the whole pipeline on an empty project in processes of its own, everything but `features.detector` at its
 default. Seconds are those of features and matches together, on the clock and of all cores: on a machine that others use
-the latter tell more. What `auto` takes, and why, is printed below each set.
+the latter tell more. What `auto` takes, and why, is printed below each set. Learned detectors need the extra `learned`.
 """
 
 import argparse
@@ -19,7 +19,6 @@ from typing import Any
 from benchmarks.photos import IMAGES, RESULTS, ROOT
 from jaxba.pipeline import PIPELINE, run_pipeline
 
-DETECTORS = ("sift", "orb")
 _COLUMNS = (
     "set", "detector", "adjusted", "good, weak, rejected pairs", "points seen 3 times or more", "median px",
     "fit to GNSS, RMS (m)", "features + match (s)", "of all cores (s)",
@@ -29,17 +28,20 @@ _COLUMNS = (
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.detectors", description=__doc__)
     parser.add_argument("sets", nargs="+", help=f"folders below {IMAGES}, or others")
+    parser.add_argument("--detectors", nargs="+", default=["sift", "orb"])
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args(arguments)
     print(f"| {' | '.join(_COLUMNS)} |\n|{' --- |' * len(_COLUMNS)}")
     for name in options.sets:
         photos = Path(name) if Path(name).is_dir() else IMAGES / name
-        result = {detector: measure(photos, detector, options.workers) for detector in DETECTORS}
+        result = {detector: measure(photos, detector, options.workers) for detector in options.detectors}
         for detector, row in result.items():
             print(line(photos.name, detector, row), flush=True)
         result["auto"] = decision(photos)
         print(f"{photos.name}: {result['auto']}", flush=True)
-        (RESULTS / f"detectors_{photos.name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        kept = RESULTS / f"detectors_{photos.name}.json"
+        before = json.loads(kept.read_text()) if kept.exists() else {}
+        kept.write_text(json.dumps({**before, **result}, indent=1) + "\n")
 
 
 def measure(photos: Path, detector: str, workers: int) -> dict[str, Any]:
@@ -72,11 +74,15 @@ def line(name: str, detector: str, row: dict[str, Any]) -> str:
     if adjust is None:
         cells = [row["stopped"]["reason"], pairs, "", "", ""]
     else:
-        fit = "none" if adjust["gnss_rms_m"] is None else ", ".join(f"{rms:.2f}" for rms in adjust["gnss_rms_m"])
+        fit = ", ".join(_number(rms) for rms in adjust["gnss_rms_m"] or [None])
         adjusted = f"{adjust['images']} of {adjust['photos']}"
-        cells = [adjusted, pairs, str(adjust["points_seen_thrice"]), f"{adjust['median_px']:.2f}", fit]
+        cells = [adjusted, pairs, str(adjust["points_seen_thrice"]), _number(adjust["median_px"]), fit]
     cells = [name, detector, *cells, f"{row['seconds']:.0f}", f"{row['cpu_seconds']:.0f}"]
     return f"| {' | '.join(cells)} |"
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.2f}"
 
 
 _WEAK, _REJECTED = ("min_good", "min_inlier_ratio"), ("matches", "verified")

@@ -40,7 +40,7 @@ PUBLISHED = {  # the defaults and ranges that users of such pipelines know
     "crs.target_crs": ("none", ""),
     "crs.h_accuracy_threshold": ("2", "0.05 to 100"),
     "crs.altitude_variance": ("0.05", "0.01 to 0.5"),
-    "features.detector": ("auto", "auto, sift, orb, akaze"),
+    "features.detector": ("auto", "auto, sift, orb, akaze, aliked, xfeat"),
     "features.nfeatures": ("none", "2000 to 20000"),
     "features.contrast_threshold": ("none", "0.02 to 0.08"),
     "features.edge_threshold": ("none", "5 to 20"),

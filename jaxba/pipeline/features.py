@@ -17,16 +17,19 @@ from jaxba.engine import Resources
 from jaxba.engine._limits import check_room
 from jaxba.engine._parameters import Parameters, parameter
 from jaxba.engine._store import Stored
+from jaxba.engine._workers import megapixels_of
 from jaxba.pipeline._routing import Routing
 from jaxba.report import Told, grouped, with_ranges
-from jaxba.scene import Features, LeftOut, Photo, described
+from jaxba.scene import DETECTORS, LEARNED, Features, LeftOut, Photo, described
 from jaxba.vision import (
     CONDITIONS,
     OrbOptions,
     Pixels,
     Tuning,
+    check_detector,
     decode,
     detect_features,
+    learned_bytes,
     measure_image,
     most_keypoints,
     read_mask,
@@ -54,9 +57,9 @@ class Params(Parameters):
 
     detector: str = parameter(
         "auto",
-        choices=("auto", "sift", "orb", "akaze"),
+        choices=("auto", *DETECTORS),
         help="kind of features, of all photos; auto: SIFT over sift_gsd, under sift_overlap or where these are "
-        "unknown, else ORB",
+        "unknown, else ORB; aliked and xfeat are learned, and need more packages",
     )
     sift_gsd: float = parameter(0.05, low=0.005, high=1, help="m/px; auto takes SIFT over this ground sample distance")
     sift_overlap: float = parameter(
@@ -69,7 +72,10 @@ class Params(Parameters):
         help="what thresholds that are not set follow; auto measures each photo; several by commas",
     )
     nfeatures: int | None = parameter(
-        None, low=2000, high=20000, help="the most keypoints an image; none: 8000 SIFT and AKAZE, 10000 ORB"
+        None,
+        low=2000,
+        high=20000,
+        help="the most keypoints an image; none: 8000 SIFT and AKAZE, 10000 ORB, 2000 a turn learned",
     )
     contrast_threshold: float | None = parameter(
         None,
@@ -93,6 +99,12 @@ class Params(Parameters):
     orb_patch: int = parameter(31, low=15, high=63, help="ORB: side of what a keypoint describes, px of each level")
     orb_score: str = parameter("harris", choices=("harris", "fast"), help="ORB: by which the strongest are kept")
     wta_k: int = parameter(2, low=2, high=4, help="ORB: pixels compared at a time; 3 and 4 double the descriptors")
+    learned_side: int = parameter(
+        1600, low=640, high=6000, help="learned: px of the longer side, to which larger photos are scaled"
+    )
+
+    def check_installed(self) -> None:
+        check_detector(self.detector)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,6 +199,14 @@ def check_store(store: Path, num_photos: int, detector: str, params: Params, res
     )
 
 
+def megapixels_to_hold(photo: Photo, detector: str, params: Params) -> float:
+    """Return the size of the photo that needs as much memory with SIFT as this one with a detector."""
+    if detector not in LEARNED:
+        return photo.megapixels
+    scale = min(1.0, params.learned_side / max(photo.width_px, photo.height_px))
+    return max(photo.megapixels, megapixels_of(learned_bytes(detector, photo.megapixels * scale**2)))
+
+
 def lines(outputs: Detected, told: Told) -> list[str]:
     """Return what was made of all photos, in words."""
     found = {index: outputs[index] for index in sorted(outputs)}
@@ -216,8 +236,10 @@ def _detect(pixels: Pixels, mask: UInt8[np.ndarray, "height width"] | None, tuni
             sigma=params.sigma,
             mask=mask,
         )
-    if tuning.detector == "akaze":
-        return detect_features(pixels, detector="akaze", nfeatures=tuning.nfeatures, mask=mask)
+    if tuning.detector != "orb":
+        return detect_features(
+            pixels, detector=tuning.detector, nfeatures=tuning.nfeatures, side_px=params.learned_side, mask=mask
+        )
     assert tuning.fast_threshold is not None and tuning.nlevels is not None
     options = OrbOptions(
         fast_threshold=tuning.fast_threshold,

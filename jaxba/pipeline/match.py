@@ -60,6 +60,7 @@ class Params(Parameters):
     """What the user may set."""
 
     ratio: float = parameter(0.75, low=0.6, high=0.85, help="nearest over second nearest descriptor distance")
+    learned_ratio: float = parameter(0.9, low=0.6, high=0.98, help="the same of learned descriptors")
     ransac_threshold: float | None = parameter(
         None,
         low=0.5,
@@ -181,7 +182,7 @@ def _matched(
     first, second = inputs.photos[inputs.image], inputs.photos[partner]
     threshold_px = float(params.ransac_threshold or _threshold_px(first, second, overlap))
     options = PairOptions(
-        ratio=params.ratio,
+        ratio=params.learned_ratio if features.kind == "unit" else params.ratio,
         threshold_px=threshold_px,
         epipolar_threshold_px=None if params.epipolar_threshold is None else float(params.epipolar_threshold),
         confidence=float(params.confidence),

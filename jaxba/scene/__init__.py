@@ -8,6 +8,15 @@ from jaxba.scene._block import Block
 from jaxba.scene._candidates import joining_pairs, nearest_pairs, pairs_between, rising_pairs, window_pairs
 from jaxba.scene._control import Control, ControlFit
 from jaxba.scene._described import described, fault, lacks_memory
+from jaxba.scene._descriptors import (
+    DETECTORS,
+    LEARNED,
+    DescriptorKind,
+    descriptor_distances,
+    descriptor_vectors,
+    distances_of_products,
+    unit_bytes,
+)
 from jaxba.scene._features import Features
 from jaxba.scene._finding import Finding
 from jaxba.scene._footprint import Footprints, footprint_overlaps, footprint_pairs, ground_footprints
@@ -23,10 +32,12 @@ from jaxba.scene._tracks import Tracks
 from jaxba.scene._view_graph import EdgeStatus, PrunedEdge, ViewGraph
 
 __all__ = [
-    "AssumedDatum", "Attitude", "BarFit", "Block", "Claim", "CommonOffset", "Control", "ControlFit", "EdgeStatus",
-    "Fallback", "Features", "Finding", "Fix", "FlightOffsets", "FocalSource", "Footprints", "HeightKind", "LeftOut",
-    "Lens", "LocalFrame", "MeasuredKind", "Missed", "Model", "PairRecord", "Photo", "PhotoFile", "Position",
-    "PrunedEdge", "Reconstruction", "Reference", "ScaleBars", "SurveyStatistics", "Tracks", "ViewGraph", "build_tracks",
-    "cam_from_enu", "components", "described", "fault", "footprint_overlaps", "footprint_pairs", "ground_footprints",
-    "joining_pairs", "lacks_memory", "nearest_pairs", "pairs_between", "rising_pairs", "window_pairs",
+    "DETECTORS", "LEARNED", "AssumedDatum", "Attitude", "BarFit", "Block", "Claim", "CommonOffset", "Control",
+    "ControlFit", "DescriptorKind", "EdgeStatus", "Fallback", "Features", "Finding", "Fix", "FlightOffsets",
+    "FocalSource", "Footprints", "HeightKind", "LeftOut", "Lens", "LocalFrame", "MeasuredKind", "Missed", "Model",
+    "PairRecord", "Photo", "PhotoFile", "Position", "PrunedEdge", "Reconstruction", "Reference", "ScaleBars",
+    "SurveyStatistics", "Tracks", "ViewGraph", "build_tracks", "cam_from_enu", "components", "described",
+    "descriptor_distances", "descriptor_vectors", "distances_of_products", "fault", "footprint_overlaps",
+    "footprint_pairs", "ground_footprints", "joining_pairs", "lacks_memory", "nearest_pairs", "pairs_between",
+    "rising_pairs", "unit_bytes", "window_pairs",
 ]  # fmt: skip

@@ -1,12 +1,11 @@
 """Features of one image: keypoints in pixels, their descriptors, their colours."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-Detector = Literal["sift", "orb", "akaze"]
+from jaxba.scene._descriptors import KIND_OF, DescriptorKind, Detector
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,6 +32,11 @@ class Features:
     mean_brightness: float
     coverage: float
     notes: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> DescriptorKind:
+        """How the descriptors are compared."""
+        return KIND_OF[self.detector]
 
     @property
     def num_keypoints(self) -> int:

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import KDTree
 
-from jaxba.scene import Block, Features, Photo, Tracks
+from jaxba.scene import Block, DescriptorKind, Features, Photo, Tracks, descriptor_distances
 from jaxba.sfm._cores import on_all_cores
 from jaxba.sfm._views import Views
 
@@ -77,7 +77,7 @@ class _Known:
 
     descriptors: UInt8[np.ndarray, "points 2 length"]
     is_described: Bool[np.ndarray, " points"]
-    is_binary: bool
+    kind: DescriptorKind
     limit: float
 
     @staticmethod
@@ -86,27 +86,27 @@ class _Known:
         point_of_track[block.track_index] = np.arange(block.num_points)
         starts = np.searchsorted(tracks.track_index, block.track_index)
         ends = np.searchsorted(tracks.track_index, block.track_index, side="right") - 1
-        descriptors, is_binary = None, False
+        descriptors, kind = None, None
         is_described = np.ones(block.num_points, bool)
         for image in np.unique(tracks.image_index[np.concatenate([starts, ends])]):
             found = features[int(image)]
             if descriptors is None:
                 descriptors = np.zeros((block.num_points, 2, found.descriptors.shape[1]), np.uint8)
-                is_binary = found.detector != "sift"
+                kind = found.kind
             for slot, rows in enumerate((starts, ends)):
                 here = np.flatnonzero(tracks.image_index[rows] == image)
                 has_one = tracks.feature_index[rows[here]] < found.num_keypoints
                 is_described[here[~has_one]] = False
                 here = here[has_one]
                 descriptors[here, slot] = found.descriptors[tracks.feature_index[rows[here]]]
-        if descriptors is None or is_described.sum() < _LEAST_PAIRS:
+        if descriptors is None or kind is None or is_described.sum() < _LEAST_PAIRS:
             return None
         described = np.flatnonzero(is_described)
         between = [
-            _distances(descriptors[some, 0], descriptors[some, 1], is_binary)
+            descriptor_distances(descriptors[some, 0], descriptors[some, 1], kind)
             for some in np.array_split(described, len(described) // _PIECE + 1)
         ]
-        return _Known(descriptors, is_described, is_binary, float(np.quantile(np.concatenate(between), _QUANTILE)))
+        return _Known(descriptors, is_described, kind, float(np.quantile(np.concatenate(between), _QUANTILE)))
 
 
 def _links_in(
@@ -145,7 +145,7 @@ def _links_in(
     which, slot = np.nonzero(np.isfinite(near))
     point, feature = points[which], feature[which, slot]
     given = np.asarray(found.descriptors)[feature]
-    distance = np.minimum(*(_distances(known.descriptors[point, side], given, known.is_binary) for side in (0, 1)))
+    distance = np.minimum(*(descriptor_distances(known.descriptors[point, side], given, known.kind) for side in (0, 1)))
     keep = (distance <= known.limit) & _is_first(point, distance)
     keep[keep] = _is_first(place[feature[keep]], distance[keep])
     point, feature = point[keep], feature[keep]
@@ -199,17 +199,6 @@ def _joined(tracks: Tracks, links: _Links) -> Tracks:
         xy_px=np.concatenate([tracks.xy_px, links.xy_px[added]])[order],
         rgb=tracks.rgb[kept],
     )
-
-
-def _distances(
-    first: UInt8[np.ndarray, "n length"], second: UInt8[np.ndarray, "n length"], is_binary: bool
-) -> Float[np.ndarray, " n"]:
-    """Return distances of descriptors: bits that differ, or of SIFT's square roots (unit length)."""
-    if is_binary:
-        return np.bitwise_count(first ^ second).sum(axis=1, dtype=np.float64)
-    product = np.sqrt(first.astype(np.float32) * second).sum(axis=1, dtype=np.float64)
-    total = first.sum(axis=1, dtype=np.float64) * second.sum(axis=1, dtype=np.float64)
-    return np.sqrt(np.maximum(2 - 2 * product / np.sqrt(np.maximum(total, 1.0)), 0.0))
 
 
 def _is_first(group: Int[np.ndarray, " n"], value: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:

@@ -4,9 +4,11 @@ from ._decode import Pixels as Pixels, decode as decode, read_mask as read_mask
 from ._exif import image_size as image_size
 from ._features import (
     OrbOptions as OrbOptions,
+    check_detector as check_detector,
     detect_features as detect_features,
     grid_coverage as grid_coverage,
 )
+from ._learned import learned_bytes as learned_bytes, learned_packages as learned_packages
 from ._likeness import alike_pairs as alike_pairs
 from ._nearest import (
     Descriptors as Descriptors,

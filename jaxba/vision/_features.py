@@ -1,4 +1,4 @@
-"""Keypoints and descriptors of one image by OpenCV, tuned for aerial photos.
+"""Keypoints and descriptors of one image, by OpenCV tuned for aerial photos, or learned (see `_learned.py`).
 
 Position. OpenCV counts from the centre of the first pixel, so 0.5 is added. SIFT's doubled first octave shifts
 keypoints by 0.25 px unless `enable_precise_upscale` is set. ORB's pixel p of a level that is s times coarser is
@@ -25,8 +25,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxba._errors import JaxbaError
-from jaxba.scene import Features
+from jaxba.scene import LEARNED, Features
 from jaxba.vision._decode import Pixels
+from jaxba.vision._learned import Keypoints, check_learned, detect_learned, load_network
 
 _SIFT_LAYERS = 3
 _ONE_OF_FOUR = np.array([1, 2, 4, 8], np.uint8)
@@ -60,16 +61,17 @@ def detect_features(
     edge_threshold: float = 10.0,
     sigma: float = 1.6,
     orb: OrbOptions = OrbOptions(),
+    side_px: int = 1600,
     mask: UInt8[np.ndarray, "height width"] | None = None,
 ) -> Features:
     """Return the features of the best `nfeatures` keypoints of an image; a frame without texture has none.
 
-    `contrast_threshold`, `contrast_floor`, `edge_threshold` and `sigma` (px, blur of the first octave) are SIFT's. No
-    keypoint lies where `mask` is 0.
+    `contrast_threshold`, `contrast_floor`, `edge_threshold` and `sigma` (px, blur of the first octave) are SIFT's,
+    `side_px` is of learned detectors (see `detect_learned`). No keypoint lies where `mask` is 0.
 
-    SIFT keeps the largest keypoints, ORB the strongest; a SIFT keypoint with several orientations counts once.
+    SIFT keeps the largest keypoints, the others the strongest; a keypoint with several orientations counts once.
 
-    Raises `JaxbaError` for a detector that the installed OpenCV lacks.
+    Raises `JaxbaError` for a detector that is not installed.
 
     >>> squares = np.kron(np.random.default_rng(0).integers(0, 255, (20, 30)), np.ones((8, 8))).astype(np.uint8)
     >>> features = detect_features(Pixels(gray=squares, rgb=np.dstack([squares] * 3)))
@@ -77,45 +79,54 @@ def detect_features(
     (True, True)
     """
     brightness = float(pixels.gray.mean())
-    notes = []
-    if detector == "sift":
-        floor = min(contrast_floor, contrast_threshold)
-        keypoints, descriptors, note = _sift(
-            pixels.gray, mask, nfeatures, contrast_threshold, floor, edge_threshold, sigma
-        )
-        notes += [note] * bool(note)
-    elif detector == "orb":
-        keypoints, descriptors = _orb(pixels.gray, mask, nfeatures, orb)
-    else:
-        keypoints, descriptors = _akaze(pixels.gray, mask)
-    rows = np.array([(*k.pt, k.size, k.angle, k.response, k.octave) for k in keypoints], np.float64).reshape(-1, 6)
-    x, y, size, angle, response, octave = rows.T
     height, width = pixels.gray.shape
-    xy_px = np.stack([x, y], axis=1) + 0.5
-    if detector == "orb":
-        scale = orb.scale_factor ** octave[:, None]
-        size_px = np.array([width, height])
-        xy_px = (np.stack([x, y], axis=1) / scale + 0.5) * (size_px / np.rint(size_px / scale))
-    # SIFT's come in their order; the descriptors of the others do not depend on it
-    order = np.arange(len(x)) if detector == "sift" else np.lexsort([angle, size, x, y, -response])[:nfeatures]
-    xy_px = xy_px[order]
+    notes = []
+    check_detector(detector)
+    if detector in LEARNED:
+        found = detect_learned(load_network(detector), pixels.rgb, nfeatures, side_px=side_px, mask=mask)
+    else:
+        if detector == "sift":
+            floor = min(contrast_floor, contrast_threshold)
+            keypoints, descriptors, note = _sift(
+                pixels.gray, mask, nfeatures, contrast_threshold, floor, edge_threshold, sigma
+            )
+            notes += [note] * bool(note)
+        elif detector == "orb":
+            keypoints, descriptors = _orb(pixels.gray, mask, nfeatures, orb)
+        else:
+            keypoints, descriptors = _akaze(pixels.gray, mask)
+        found = _of_opencv(keypoints, descriptors, detector, (width, height), nfeatures, orb)
     if mask is not None:
         notes.append(f"{np.mean(mask == 0):.0%} of the photo is masked")
-    if len(order) == 0:
+    if len(found.xy_px) == 0:
         notes.append(f"no texture: zero keypoints at a mean brightness of {brightness:.0f} of 255")
-    column = np.clip(xy_px[:, 0], 0, width - 1).astype(int)
-    row = np.clip(xy_px[:, 1], 0, height - 1).astype(int)
+    column = np.clip(found.xy_px[:, 0], 0, width - 1).astype(int)
+    row = np.clip(found.xy_px[:, 1], 0, height - 1).astype(int)
     return Features(
         detector=detector,  # pyright: ignore[reportArgumentType]
-        xy_px=xy_px,
-        size_px=size[order],
-        angle_rad=np.deg2rad(angle[order]),
-        descriptors=np.ascontiguousarray(descriptors[order]),
+        xy_px=found.xy_px,
+        size_px=found.size_px,
+        angle_rad=found.angle_rad,
+        descriptors=found.descriptors,
         rgb=pixels.rgb[row, column],
         mean_brightness=brightness,
-        coverage=grid_coverage(xy_px, width, height),
+        coverage=grid_coverage(found.xy_px, width, height),
         notes=tuple(notes),
     )
+
+
+def check_detector(detector: str) -> None:
+    """Raise `JaxbaError` where a detector is not installed; learned ones are not imported for it."""
+    if detector in LEARNED:
+        check_learned(detector)
+    elif detector == "akaze":
+        import cv2
+
+        if not hasattr(cv2, "AKAZE_create"):
+            raise JaxbaError(
+                f"features.detector=akaze: OpenCV {cv2.__version__} has none in its main module; take sift or orb, "
+                "or install opencv-python-headless<5."
+            )
 
 
 def grid_coverage(xy_px: Float[np.ndarray, "points 2"], width_px: int, height_px: int) -> float:
@@ -126,6 +137,31 @@ def grid_coverage(xy_px: Float[np.ndarray, "points 2"], width_px: int, height_px
     """
     cell = np.clip(np.floor(xy_px * [8 / width_px, 8 / height_px]), 0, 7).astype(int)
     return float(len(np.unique(cell[:, 0] + 8 * cell[:, 1])) / 64)
+
+
+def _of_opencv(
+    keypoints: Any,
+    descriptors: UInt8[np.ndarray, "keypoints length"],
+    detector: str,
+    image_px: tuple[int, int],
+    nfeatures: int,
+    orb: OrbOptions,
+) -> Keypoints:
+    """Return OpenCV's keypoints in the convention of pixels here, the best first."""
+    rows = np.array([(*k.pt, k.size, k.angle, k.response, k.octave) for k in keypoints], np.float64).reshape(-1, 6)
+    x, y, size, angle, response, octave = rows.T
+    xy_px = np.stack([x, y], axis=1) + 0.5
+    if detector == "orb":
+        scale = orb.scale_factor ** octave[:, None]
+        xy_px = (np.stack([x, y], axis=1) / scale + 0.5) * (np.array(image_px) / np.rint(np.array(image_px) / scale))
+    # SIFT's come in their order; the descriptors of the others do not depend on it
+    order = np.arange(len(x)) if detector == "sift" else np.lexsort([angle, size, x, y, -response])[:nfeatures]
+    return Keypoints(
+        xy_px=xy_px[order],
+        size_px=size[order],
+        angle_rad=np.deg2rad(angle[order]),
+        descriptors=np.ascontiguousarray(descriptors[order]),
+    )
 
 
 def _sift(
@@ -209,10 +245,5 @@ def _akaze(
 ) -> tuple[Any, UInt8[np.ndarray, "keypoints 61"]]:
     import cv2
 
-    if not hasattr(cv2, "AKAZE_create"):
-        raise JaxbaError(
-            f"detector akaze: OpenCV {cv2.__version__} has none in its main module; take sift or orb, "
-            "or install opencv-python-headless<5."
-        )
     keypoints, descriptors = cv2.AKAZE_create().detectAndCompute(gray, mask)  # pyright: ignore
     return (keypoints, descriptors) if descriptors is not None else ((), np.zeros((0, 61), np.uint8))

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.cluster.vq import kmeans2
 
-from jaxba.scene import Features, rising_pairs
-from jaxba.vision._nearest import ratio_matches, signed_bits, two_nearest, two_nearest_hamming, unit_descriptors
+from jaxba.scene import DescriptorKind, Features, descriptor_vectors, rising_pairs
+from jaxba.vision._nearest import ratio_matches, two_nearest
 
 _WORDS, _ROUNDS = 64, 10
 _BEST = 1500  # descriptors of an image
@@ -67,23 +67,21 @@ def _most_alike(
 
 def _num_matches(features: Mapping[int, Features], pairs: Int[np.ndarray, "pairs 2"]) -> Int[np.ndarray, " pairs"]:
     """Return how many of the best descriptors match in each pair, by ratio test and mutual check."""
-    ready: dict[int, tuple[np.ndarray, bool]] = {}
+    ready: dict[int, tuple[np.ndarray, DescriptorKind]] = {}
     for index in np.unique(pairs).tolist():
-        each = features[index]
-        ready[index] = each.descriptors[:_MATCHED].copy(), each.detector == "sift"
+        ready[index] = features[index].descriptors[:_MATCHED].copy(), features[index].kind
     found = np.zeros(len(pairs), np.int64)
     for k, (i, j) in enumerate(pairs.tolist()):
-        (first, is_sift), (second, _) = ready[i], ready[j]
+        (first, kind), (second, _) = ready[i], ready[j]
         if len(second) < 2:  # no second nearest
             continue
-        prepare, search = (unit_descriptors, two_nearest) if is_sift else (signed_bits, two_nearest_hamming)
-        found[k] = len(ratio_matches(search(prepare(first), prepare(second)), _RATIO)[0])
+        nearest = two_nearest(descriptor_vectors(first, kind), descriptor_vectors(second, kind), kind)
+        found[k] = len(ratio_matches(nearest, _RATIO)[0])
     return found
 
 
 def _best(features: Features, count: int) -> Float[np.ndarray, "rows length"]:
-    best = np.asarray(features.descriptors[:count])
-    return unit_descriptors(best) if features.detector == "sift" else signed_bits(best)
+    return descriptor_vectors(np.asarray(features.descriptors[:count]), features.kind)
 
 
 def _words(features: Mapping[int, Features], images: Int[np.ndarray, " n"]) -> Float[np.ndarray, "words length"]:

@@ -1,19 +1,17 @@
 """Matches between two sets of descriptors: exact two nearest neighbours, ratio test, mutual check.
 
-SIFT descriptors a are compared as sqrt(a / sum(a)) (Arandjelovic and Zisserman 2012, "Three things everyone should
-know"), which have unit length, so that the squared distance is 2 - 2 <a, b>: one blocked matrix product, in blocks of
-rows that stay in the cache, finds the nearest and the second nearest of each row, and the nearest of each column.
-8000 x 8000 takes 0.2 s on one core, 0.17 s of it in the product. Bits are compared by Hamming distance, through the
-same product: of n bits written as 1 and -1 it is (n - <a, b>) / 2, exactly. 10000 x 10000 of 256 bits take 1.0 s of a
-core where OpenCV's BFMatcher, once in each direction, takes 2.3 s.
+Descriptors of every kind are vectors whose products tell their distances. One blocked matrix product, in blocks of rows
+that stay in the cache, finds the nearest and the second nearest of each row, and the nearest of each column. 8000 x
+8000 of SIFT take 0.2 s on one core, 0.17 s of it in the product. 10000 x 10000 of 256 bits take 1.0 s of a core where
+OpenCV's BFMatcher, once in each direction, takes 2.3 s.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
-from jaxba.scene import Features
+from jaxba.scene import DescriptorKind, Features, descriptor_vectors, distances_of_products
 
 _BLOCK = 256
 
@@ -37,12 +35,12 @@ class Descriptors:
     """
 
     values: Float[np.ndarray, "rows length"]
-    is_binary: bool
+    kind: DescriptorKind
     first_index: Int[np.ndarray, " rows"]
 
     def take(self, rows: Int[np.ndarray, " some"]) -> "Descriptors":
         """Return some of them; matches still name features by their place among all."""
-        return Descriptors(values=self.values[rows], is_binary=self.is_binary, first_index=self.first_index[rows])
+        return Descriptors(values=self.values[rows], kind=self.kind, first_index=self.first_index[rows])
 
     def first(self, count: int) -> "Descriptors":
         """Return as many of them."""
@@ -50,43 +48,20 @@ class Descriptors:
 
     def distances(self, products: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Return the distances of descriptors whose products are given."""
-        return _hamming(products, self.values.shape[1]) if self.is_binary else _distance(products)
+        return distances_of_products(products, self.values.shape[1], self.kind)
 
 
-def unit_descriptors(descriptors: UInt8[np.ndarray, "rows length"]) -> Float[np.ndarray, "rows length"]:
-    """Return the square roots of SIFT descriptors that sum to 1, float32 of unit length.
-
-    >>> unit_descriptors(np.array([[9, 16, 0, 0]], np.uint8)).tolist()
-    [[0.6000000238418579, 0.800000011920929, 0.0, 0.0]]
-    """
-    total = np.maximum(descriptors.sum(axis=1, dtype=np.int64), 1).astype(np.float32)
-    return np.sqrt(descriptors / total[:, None], dtype=np.float32)
-
-
-def two_nearest(first: Float[np.ndarray, "rows length"], second: Float[np.ndarray, "columns length"]) -> Neighbours:
-    """Return the two nearest in `second` of each row of `first`, both float32 of unit length, `second` of 2 at least.
+def two_nearest(
+    first: Float[np.ndarray, "rows length"], second: Float[np.ndarray, "columns length"], kind: DescriptorKind
+) -> Neighbours:
+    """Return the two nearest in `second` of each row of `first`, vectors of descriptors, `second` of 2 at least.
 
     Of equally near ones the lower index is taken, and of several rows that a column is equally near to only the first
     is mutual.
     """
     index, best, next_best, is_mutual = _most_alike(first, second)
-    return Neighbours(index=index, nearest=_distance(best), second=_distance(next_best), is_mutual=is_mutual)
-
-
-def two_nearest_hamming(first: Float[np.ndarray, "rows bits"], second: Float[np.ndarray, "columns bits"]) -> Neighbours:
-    """Return the same by Hamming distance of bits that are written as 1 and -1, float32."""
-    index, best, next_best, is_mutual = _most_alike(first, second)
-    nearest, following = (_hamming(products, first.shape[1]) for products in (best, next_best))
+    nearest, following = (distances_of_products(products, first.shape[1], kind) for products in (best, next_best))
     return Neighbours(index=index, nearest=nearest, second=following, is_mutual=is_mutual)
-
-
-def signed_bits(descriptors: UInt8[np.ndarray, "rows length"]) -> Float[np.ndarray, "rows bits"]:
-    """Return the bits of descriptors as 1 and -1, float32.
-
-    >>> signed_bits(np.array([[5]], np.uint8)).tolist()
-    [[-1.0, -1.0, -1.0, -1.0, -1.0, 1.0, -1.0, 1.0]]
-    """
-    return 2.0 * np.unpackbits(descriptors, axis=1).astype(np.float32) - 1.0
 
 
 def _most_alike(
@@ -126,10 +101,9 @@ def ratio_matches(
 
 def prepare_descriptors(features: Features) -> Descriptors:
     """Return an image's descriptors made ready for `match_descriptors`."""
-    is_binary = features.detector != "sift"
-    values = signed_bits(features.descriptors) if is_binary else unit_descriptors(features.descriptors)
+    values = descriptor_vectors(features.descriptors, features.kind)
     _, first, place = np.unique(features.xy_px, axis=0, return_index=True, return_inverse=True)
-    return Descriptors(values=values, is_binary=is_binary, first_index=first[place.reshape(-1)])
+    return Descriptors(values=values, kind=features.kind, first_index=first[place.reshape(-1)])
 
 
 def match_descriptors(
@@ -140,15 +114,16 @@ def match_descriptors(
     Each position of an image is in one match at most.
 
     >>> values = np.random.default_rng(0).integers(0, 255, (30, 128)).astype(np.uint8)
-    >>> first = Descriptors(values=unit_descriptors(values), is_binary=False, first_index=np.arange(30))
-    >>> second = Descriptors(values=first.values[::-1], is_binary=False, first_index=np.arange(30))
+    >>> vectors = descriptor_vectors(values, "histogram")
+    >>> first = Descriptors(values=vectors, kind="histogram", first_index=np.arange(30))
+    >>> second = Descriptors(values=vectors[::-1], kind="histogram", first_index=np.arange(30))
     >>> match_descriptors(first, second, 0.75)[0][:3].tolist()
     [[0, 29], [1, 28], [2, 27]]
     """
     if min(len(first.values), len(second.values)) < 2:
         return np.zeros((0, 2), np.int64), np.zeros(0)
-    search = two_nearest_hamming if first.is_binary else two_nearest
-    return one_of_a_position(first, second, *ratio_matches(search(first.values, second.values), ratio))
+    neighbours = two_nearest(first.values, second.values, first.kind)
+    return one_of_a_position(first, second, *ratio_matches(neighbours, ratio))
 
 
 def one_of_a_position(
@@ -165,11 +140,3 @@ def one_of_a_position(
         matches, distinctiveness = matches[kept], distinctiveness[kept]
     order = np.argsort(matches[:, 0], kind="stable")
     return matches[order], distinctiveness[order]
-
-
-def _hamming(products: Float[np.ndarray, " rows"], num_bits: int) -> Float[np.ndarray, " rows"]:
-    return (num_bits - products.astype(np.float64)) / 2
-
-
-def _distance(similarity: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-    return np.sqrt(np.maximum(2.0 - 2.0 * similarity.astype(np.float64), 0.0))

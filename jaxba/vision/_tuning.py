@@ -12,12 +12,14 @@ A parameter that the user set stays as it is.
 
 from dataclasses import dataclass
 
+from jaxba.vision._learned import TURNS
 from jaxba.vision._statistics import ImageStatistics
 
 CONDITIONS = ("low_light", "rows", "water", "varying_height")
 
 _OTHER_BYTES = 35.0  # of a keypoint: position, size and angle in float64, colour
 _DESCRIPTOR_BYTES = {"orb": 32, "akaze": 61}
+_LEARNED_BYTES = {"aliked": 128, "xfeat": 64}
 _SIFT_BYTES, _SIFT_ORIENTATIONS = 128, 1.3  # up to 1.25 were measured at 2000 keypoints a photo
 _PHOTO_BYTES = 6000  # record and headers
 _DARK, _REPEATING, _FLAT = 80.0, 0.2, 0.3
@@ -25,6 +27,8 @@ _BASE: dict[str, dict[str, float | int]] = {
     "sift": {"nfeatures": 8000, "contrast_threshold": 0.04, "edge_threshold": 10.0},
     "orb": {"nfeatures": 10000, "fast_threshold": 20, "nlevels": 8},
     "akaze": {"nfeatures": 8000},
+    "aliked": {"nfeatures": 2000},
+    "xfeat": {"nfeatures": 2000},
 }
 _EFFECT: dict[tuple[str, str], tuple[str, float | int]] = {
     ("low_light", "sift"): ("contrast_threshold", 0.03),
@@ -118,6 +122,8 @@ def store_bytes(num_photos: int, detector: str, nfeatures: int) -> float:
     """Return the bytes that the features of so many photos take on the disk at most."""
     if detector in _DESCRIPTOR_BYTES:
         keypoint = _DESCRIPTOR_BYTES[detector] + _OTHER_BYTES
+    elif detector in _LEARNED_BYTES:
+        keypoint = (_LEARNED_BYTES[detector] + _OTHER_BYTES) * TURNS
     else:
         keypoint = (_SIFT_BYTES + _OTHER_BYTES) * _SIFT_ORIENTATIONS
     return num_photos * (nfeatures * keypoint + _PHOTO_BYTES)

@@ -44,7 +44,7 @@ def test_a_change_changes_that_parameter_alone(text, value):
         ("match.ratio=nan", "out of range"),
         ("match.ratio=high", "match.ratio=high: give a number"),
         ("match.min_inliers=12.5", "give a whole number"),
-        ("features.detector=surf", "allowed: auto, sift, orb, akaze"),
+        ("features.detector=surf", "allowed: auto, sift, orb, akaze, aliked, xfeat"),
         (
             "features.condition=rows,snow",
             "low_light, rows, .* or several of them with commas between",

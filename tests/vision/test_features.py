@@ -169,5 +169,5 @@ def test_coverage_counts_the_cells_of_an_8_by_8_grid() -> None:
 
 @pytest.mark.skipif(hasattr(cv2, "AKAZE_create"), reason="this OpenCV has AKAZE")
 def test_akaze_that_opencv_lacks_is_an_error_with_a_way_out() -> None:
-    with pytest.raises(JaxbaError, match=r"detector akaze: OpenCV .* take sift or orb"):
+    with pytest.raises(JaxbaError, match=r"detector=akaze: OpenCV .* take sift or orb"):
         detect_features(pixels_of(texture()), detector="akaze")

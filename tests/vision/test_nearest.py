@@ -3,13 +3,17 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from jaxba.scene import Features
+from jaxba.scene import Features, descriptor_vectors
 from jaxba.vision import match_descriptors, prepare_descriptors
-from jaxba.vision._nearest import ratio_matches, signed_bits, two_nearest, two_nearest_hamming, unit_descriptors
+from jaxba.vision._nearest import ratio_matches, two_nearest
 
 
 def sift_like(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.clip(rng.gamma(0.5, 40, (count, 128)), 0, 255).astype(np.uint8)
+
+
+def histograms(descriptors: np.ndarray) -> np.ndarray:
+    return descriptor_vectors(descriptors, "histogram")
 
 
 def features_of(descriptors: np.ndarray, xy_px: np.ndarray | None = None) -> Features:
@@ -30,8 +34,8 @@ def features_of(descriptors: np.ndarray, xy_px: np.ndarray | None = None) -> Fea
 @pytest.mark.parametrize("count", [2, 255, 256, 1000])
 def test_two_nearest_are_those_of_opencvs_brute_force(count: int) -> None:
     rng = np.random.default_rng(count)
-    first, second = unit_descriptors(sift_like(rng, 700)), unit_descriptors(sift_like(rng, count))
-    found = two_nearest(first, second)
+    first, second = histograms(sift_like(rng, 700)), histograms(sift_like(rng, count))
+    found = two_nearest(first, second, "histogram")
     expected = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)
     assert np.array_equal(found.index, [m[0].trainIdx for m in expected])
     np.testing.assert_allclose(found.nearest, [m[0].distance for m in expected], atol=1e-5)
@@ -45,22 +49,22 @@ def test_distances_are_those_of_hellinger() -> None:
     a, b = sift_like(rng, 50), sift_like(rng, 60)
     p, q = a / a.sum(axis=1, keepdims=True), b / b.sum(axis=1, keepdims=True)
     hellinger = np.sqrt(2 - 2 * np.sqrt(p[:, None] * q[None]).sum(axis=2))
-    found = two_nearest(unit_descriptors(a), unit_descriptors(b))
+    found = two_nearest(histograms(a), histograms(b), "histogram")
     np.testing.assert_allclose(found.nearest, hellinger.min(axis=1), atol=1e-5)
     np.testing.assert_allclose(found.second, np.sort(hellinger, axis=1)[:, 1], atol=1e-5)
 
 
-def test_unit_descriptors_have_unit_length_and_bear_an_empty_one() -> None:
+def test_histograms_have_unit_length_and_bear_an_empty_one() -> None:
     values = np.concatenate([sift_like(np.random.default_rng(0), 20), np.zeros((1, 128), np.uint8)])
-    unit = unit_descriptors(values)
+    unit = histograms(values)
     assert unit.dtype == np.float32 and unit.flags.c_contiguous
     np.testing.assert_allclose(np.linalg.norm(unit[:20], axis=1), 1, atol=1e-6)
     assert not unit[20].any()
 
 
 def test_equal_descriptors_give_one_mutual_match_and_no_distinct_one() -> None:
-    same = unit_descriptors(np.repeat(sift_like(np.random.default_rng(0), 1), 5, axis=0))
-    found = two_nearest(same, same)
+    same = histograms(np.repeat(sift_like(np.random.default_rng(0), 1), 5, axis=0))
+    found = two_nearest(same, same, "histogram")
     assert found.index.tolist() == [0] * 5
     assert found.is_mutual.tolist() == [True, False, False, False, False]
     assert len(ratio_matches(found, 0.85)[0]) == 0
@@ -70,7 +74,7 @@ def test_hamming_is_that_of_counted_bits() -> None:
     rng = np.random.default_rng(0)
     a, b = (rng.integers(0, 256, (count, 32), dtype=np.uint8) for count in (80, 90))
     distance = 256 * cdist(np.unpackbits(a, axis=1), np.unpackbits(b, axis=1), "hamming")
-    found = two_nearest_hamming(signed_bits(a), signed_bits(b))
+    found = two_nearest(descriptor_vectors(a, "bits"), descriptor_vectors(b, "bits"), "bits")
     np.testing.assert_array_equal(found.nearest, distance.min(axis=1).round())
     np.testing.assert_array_equal(found.second, np.sort(distance, axis=1)[:, 1].round())
     assert np.array_equal(distance[np.arange(80), found.index].round(), found.nearest)
@@ -84,7 +88,7 @@ def test_bits_are_matched_as_by_opencv() -> None:
     a = rng.integers(0, 256, (300, 32), dtype=np.uint8)
     b = a[rng.permutation(300)] ^ (rng.random((300, 32)) < 0.3).astype(np.uint8)
     theirs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a, b, k=2)
-    found = two_nearest_hamming(signed_bits(a), signed_bits(b))
+    found = two_nearest(descriptor_vectors(a, "bits"), descriptor_vectors(b, "bits"), "bits")
     assert found.index.tolist() == [near.trainIdx for near, _ in theirs]
     assert found.nearest.tolist() == [near.distance for near, _ in theirs]
     assert found.second.tolist() == [other.distance for _, other in theirs]

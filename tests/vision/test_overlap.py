@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 
+from jaxba.scene import descriptor_vectors
 from jaxba.vision import common_ground
-from jaxba.vision._nearest import Descriptors, match_descriptors, unit_descriptors
+from jaxba.vision._nearest import Descriptors, match_descriptors
 
 SIZE = (1600, 1200)
 
 
 def descriptors(values: np.ndarray) -> Descriptors:
-    return Descriptors(values=unit_descriptors(values), is_binary=False, first_index=np.arange(len(values)))
+    return Descriptors(
+        values=descriptor_vectors(values, "histogram"), kind="histogram", first_index=np.arange(len(values))
+    )
 
 
 def two_images(

@@ -50,7 +50,7 @@ def test_a_place_does_not_make_a_match_of_unlike_features() -> None:
     first, second = two_images((200, 300))
     rng = np.random.default_rng(1)
     shuffled = second[2].take(rng.permutation(len(second[1])))
-    shuffled = Descriptors(values=shuffled.values, is_binary=False, first_index=np.arange(len(second[1])))
+    shuffled = Descriptors(values=shuffled.values, kind="histogram", first_index=np.arange(len(second[1])))
     assert len(guided(first, (second[0], second[1], shuffled), LEVEL_LINES, known(first, second, 40))) < 5
 
 
@@ -74,7 +74,7 @@ def test_nothing_is_found_where_all_is_foretold_outside_the_image() -> None:
 def test_matches_on_one_line_stay_those_of_the_largest_features() -> None:
     """No homography foretells a place from them."""
     _, _, looks = two_images((0, 0), count=25000)[0]
-    looks = Descriptors(values=looks.first(2000).values, is_binary=False, first_index=np.arange(2000))
+    looks = Descriptors(values=looks.first(2000).values, kind="histogram", first_index=np.arange(2000))
     along = np.column_stack([np.linspace(0, SIZE[0], 2000), np.full(2000, 600.0)])
     found = pair((np.arange(2000), along, looks), (np.arange(2000), along + np.array([50.0, 0.0]), looks))
     assert found.two_view.num_inliers >= 1500 and np.all(found.matches[:, 0] == found.matches[:, 1])

@@ -1,5 +1,7 @@
 """Every residual group: values by their formulas, derivatives those of `jax.jacfwd`, padding that does no harm."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,9 +13,10 @@ from quick_jit import quick_jit
 from scipy.spatial.transform import Rotation
 from small_problems import EVERY_CAMERA, small_problem, with_bars
 
-from jaxba.ba import AbstractPrior, AspectPrior, AttitudePrior, Rows, Step, Unknowns
+from jaxba.ba import AbstractPrior, AspectPrior, AttitudePrior, Rows, Step, Unknowns, make_plan
+from jaxba.ba._system import make_system
 from jaxba.ba.groups import PRIORS, Reprojection
-from jaxba.geometry import Pose
+from jaxba.geometry import Linear, Pose
 
 PROBLEM = with_bars(small_problem(EVERY_CAMERA[3], num_cameras=2, lever_arm=True, position_offset=True))
 UNKNOWNS = start_of(PROBLEM)
@@ -176,5 +179,23 @@ def test_rows_of_infinite_sigma_weigh_nothing_and_keep_derivatives_finite(name):
     residual, _, gradient, rows = jax.device_get(evaluate(padded, UNKNOWNS))
     touched = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
     assert touched or rows.antenna is not None
+    for leaf in jax.tree.leaves((residual, gradient, rows.residual, rows.antenna, touched)):
+        assert np.all(leaf == 0)
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_a_prior_without_rows_is_filled_up_with_rows_that_weigh_nothing(name):
+    # breaks where a part or a tile that has no row of a prior has no equations: a filled-up bar had no direction
+    prior = PROBLEM.prior(name)
+    given = {field: value for field, value in vars(prior).items() if field != "loss" and value is not None}
+    empty = dataclasses.replace(prior, **{field: np.asarray(value)[:0] for field, value in given.items()})
+    problem = eqx.tree_at(lambda p: p.priors, PROBLEM, (empty,))
+    plan = make_plan(problem)
+    (filled,) = make_system(problem, plan, Linear()).priors
+
+    unmoved = eqx.tree_at(lambda u: u.antenna, UNKNOWNS, np.zeros_like(UNKNOWNS.antenna))
+    residual, _, gradient, rows = jax.device_get(evaluate(filled, unmoved))
+    touched = [block.jacobian for block in (rows.pose, rows.intrinsics, rows.point) if block is not None]
+    assert rows.residual.shape[1] == plan.shape.prior_rows[0] > 0
     for leaf in jax.tree.leaves((residual, gradient, rows.residual, rows.antenna, touched)):
         assert np.all(leaf == 0)

@@ -47,7 +47,8 @@ class ScaleBarPrior(AbstractPrior):
 
     def _residual(self, unknowns: Unknowns) -> tuple[Float[Array, "4 rows"], Float[Array, "3 rows"]]:
         """Return the residuals, and the direction from each bar's second end to its first; zero in the second's row."""
-        std_m, is_first = jnp.asarray(self.std_m)[:, 0], jnp.asarray(self.end_index) == 0
+        std_m = jnp.asarray(self.std_m)[:, 0]
+        is_first = (jnp.asarray(self.end_index) == 0) & jnp.isfinite(std_m)  # padding may have both ends in one place
         end = self.xyz + rows_of(unknowns.position_offset, self.offset_index)
         other = self.other_xyz + rows_of(unknowns.position_offset, self._next(unknowns))
         along = jnp.where(is_first[:, None], end - other, jnp.array([1.0, 0.0, 0.0], end.dtype)).T
